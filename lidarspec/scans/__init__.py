@@ -1,9 +1,7 @@
 """Cut the points of a stream into scans.
 
-A scan is one revolution or frame period, by the sensor's declared rule.
-
-Batches of packets are converted to `Scan` objects. A `Scan` can be converted to a `LaserScan`,
-which is a planar scan as in ROS. Modules in reading order:
+A scan is one revolution or frame period. Batches of packets are converted to `Scan` objects.
+Modules in reading order:
 
 * `scan`: `Scan`, the points of one revolution.
 * `laserscan`: `LaserScan`, and the nearest return at each angle of a grid.

@@ -1,11 +1,7 @@
 """Project planar scans onto one grid of angles.
 
-A planar scan is a scan of a planar sensor, or one ring or layer of another sensor.
-
-The first complete scan determines the grid, which is the number of beams and the first and the last
-angle. The grid begins at the angle at which the scans of the sensor begin, so that times increase
-or decrease linearly over all beams. If the sensor sees less than a full turn, the grid covers its
-field of view.
+A planar scan is a scan of a planar sensor, or one ring or layer of another sensor. The first
+complete scan determines the grid: the number of beams, the first angle and the last angle.
 """
 
 from __future__ import annotations
@@ -33,11 +29,11 @@ class PlanarScans:
 
     Args:
         beams: the number of beams; by default the number that the scan or the sensor declares, or
-            else the number of points of the first complete scan.
+            the number of points of the first complete scan.
         field: the first and the last angle, radians; by default the sensor's field of view.
         ring: the ring to use from a sensor with several rings.
-        heights: the layer to use from a sensor with several rings, as a pair (low, high) in metres.
-            Points with low <= z < high belong to the layer.
+        heights: the layer to use from a sensor with several rings: the points with low <= z < high,
+            given as (low, high) in metres.
     """
 
     def __init__(
@@ -58,11 +54,8 @@ class PlanarScans:
     def project(self, scan: Scan) -> LaserScan | None:
         """Return the scan on the grid; None if the points are not in one plane.
 
-        If this object was made with `ring` or `heights`, only the points of this ring or layer are
-        projected.
-
         Raises:
-            UsageError: if the points do not have this ring.
+            UsageError: if the points do not have the chosen ring.
         """
         level = self._take_level(scan)
         if level is None:
@@ -74,10 +67,7 @@ class PlanarScans:
         return level.to_laserscan(*self._grid)
 
     def _take_level(self, scan: Scan) -> Scan | None:
-        """Return the scan with the points of the chosen ring or layer only.
-
-        Without a ring or layer, return the scan if its points are in one plane, else None.
-        """
+        """Return the scan with the points of the chosen ring or layer only."""
         cloud = scan.points
         if self._ring is None and self._heights is None:
             if self._is_flat is None and cloud.valid.any():
@@ -125,14 +115,13 @@ class PlanarScans:
 def _find_grid_start(begin: float, end: float, step: float) -> float:
     """Return the first angle of a grid over the whole turn, radians from -pi to pi.
 
-    If angles increase with time, the grid begins at the point that was measured first. If they
-    decrease, it begins at the point that was measured last.
-
     Args:
         begin: the first measured angle, radians.
         end: the last measured angle, radians.
         step: the step of the grid, radians.
     """
+    # The grid begins at the first point if angles increase with time, else at the last point, so
+    # that times are linear over all beams.
     steps = round((begin + np.pi) / step)
     if end < begin:
         steps += 1

@@ -1,11 +1,7 @@
 """Count the packets of the current scan, and the packets that are missing in it.
 
-Gaps in `Packets.index` show how many packets are missing. `Packets.breaks` shows where an unknown
-number of packets is missing. A frame counts as one packet, even if several of its parts have
-points.
-
-A packet in which one scan ends and the next one begins counts in both scans. Packets that are
-missing before this packet count in the first of the two scans.
+A frame counts as one packet, even if it has parts. A packet that contains the end of a scan counts
+in this scan and in the next one.
 """
 
 from __future__ import annotations
@@ -53,8 +49,7 @@ class PacketCounts:
         Args:
             packets: the batch.
             number: the number of packets to count.
-            points: the number of points of each packet, (number,), used as the size of the packet;
-                None to use the number of bytes.
+            points: the number of points of each packet, (number,); None to measure sizes in bytes.
             previous_index: the index of the packet before the batch; None at the start of the
                 stream.
         """
@@ -98,10 +93,8 @@ class PacketCounts:
         )
 
     def share_with_next_scan(self, row: int) -> None:
-        """Count a packet in the next scan, although the previous scan ended in it.
-
-        The next scan does not count the packets missing before it.
-        """
+        """Count a packet in the next scan, although the previous scan ended in it."""
+        # The packets missing before it count in the previous scan only.
         if not self.counts[row]:
             self.counts[row] = 1
         if self.missing[row]:
@@ -111,16 +104,7 @@ class PacketCounts:
 
 
 class OpenScan(NamedTuple):
-    """The counts of a scan that has not ended.
-
-    Attributes:
-        has_start: whether the start of the scan has arrived.
-        since: the time of the first packet of the scan, ns.
-        packets: the number of packets of the scan.
-        size: the size of the scan, in bytes or in points.
-        lost: the number of packets missing in the scan.
-        is_broken: whether an unknown number of packets is missing in the scan.
-    """
+    """The counts of a scan that has not ended."""
 
     has_start: bool = False
     since: int = 0
@@ -154,10 +138,7 @@ class OpenScan(NamedTuple):
         )
 
     def add_gap(self, packets: PacketCounts) -> OpenScan:
-        """Add the packets missing before `packets`, and return the counts of the scan.
-
-        The packets themselves are not added.
-        """
+        """Add the packets missing before `packets`, and return the counts of the scan."""
         return self._replace(
             lost=self.lost + _sum(packets.missing),
             is_broken=self.is_broken or bool(packets.is_broken.any()),

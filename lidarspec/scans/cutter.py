@@ -1,7 +1,6 @@
 """Decide where the scans of a stream end, and whether each of them is complete.
 
-A scan ends where the sensor's rule finds an end (`scan_ends`). If no end arrives in time, the scan
-ends when it reaches its limits (`limits`). Missing packets are counted in `completeness`.
+A scan ends at the end that the sensor's rule finds (`scan_ends`), or at its limits (`limits`).
 """
 
 from __future__ import annotations
@@ -28,8 +27,7 @@ SEARCHED_PACKETS = 1024
 class ScanCut(NamedTuple):
     """The end of one scan and the start of the next.
 
-    `point` is the index of the first point of the next scan. The flags describe the scan that ends
-    (see `Scan`).
+    `point` is the index of the first point of the next scan.
     """
 
     point: int
@@ -38,11 +36,7 @@ class ScanCut(NamedTuple):
 
 
 class ScanCutter:
-    """Finds the cuts between the scans of one stream.
-
-    Args:
-        sensor: the sensor that sends the stream.
-    """
+    """Finds the cuts between the scans of one stream."""
 
     def __init__(self, sensor: SensorDescription) -> None:
         rule = sensor.scan
@@ -120,14 +114,7 @@ class ScanCutter:
     def _end_scan(
         self, counts: PacketCounts, row: int, end: ScanEnd, *, is_gap_shared: bool
     ) -> ScanCut:
-        """End the scan where the rule has found an end, and begin the next scan.
-
-        Args:
-            counts: the counts of the packets.
-            row: the row of the packet with the end.
-            end: the end.
-            is_gap_shared: whether packets missing before this packet count in both scans.
-        """
+        """End the scan where the rule has found an end, and begin the next scan."""
         scan = self._scan
         is_whole = scan.is_whole and not end.is_leap
         is_first = self._usual_packets == math.inf and scan.packets > 0
@@ -157,11 +144,7 @@ class ScanCutter:
     def _cut_at_limits(
         self, packets: Packets, counts: PacketCounts, start: int, stop: int
     ) -> NDArray[np.intp]:
-        """Add packets to the scan, and cut before each packet that exceeds the limits.
-
-        Returns:
-            The rows of the packets before which the scan is cut.
-        """
+        """Add packets to the scan, and return the rows before which it exceeds the limits."""
         cuts = list[int]()
         while start < stop:
             part_stop = min(start + SEARCHED_PACKETS, stop)

@@ -16,23 +16,7 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class LaserScan:
-    """A planar scan with the attributes of the ROS message LaserScan.
-
-    Attributes:
-        ranges: (n,) float32 metres; `ranges[i]` is the nearest return at the angle ``angle_min + i
-            * angle_increment``, inf without a return.
-        intensities: (n,) float32, 0 without a return.
-        angle_min: the first angle, radians, counter-clockwise.
-        angle_max: the last angle, ``angle_min + (n - 1) * angle_increment``.
-        angle_increment: the step between angles, radians.
-        time_increment: seconds from beam to beam; negative if the angle decreases with time.
-        scan_time: seconds from scan to scan.
-        range_min: the lowest range that the sensor measures, metres.
-        range_max: the greatest range that the sensor measures, metres.
-        stamp_ns: the time at which `ranges[0]` was measured; `ranges[i]` was measured ``i *
-            time_increment`` later.
-        host_ns: the arrival time of the first packet, as in `Scan`.
-    """
+    """A planar scan with the attributes of the ROS message LaserScan."""
 
     angle_min: float
     angle_max: float
@@ -51,8 +35,6 @@ def find_nearest_returns(
     points: PointCloud, count: int, first: float, step: float
 ) -> tuple[Floats, Floats]:
     """Return the nearest return at each of `count` angles, and its intensity.
-
-    A return belongs to the angle nearest to its azimuth.
 
     Args:
         points: the points.
@@ -94,12 +76,11 @@ def unwrap_azimuths(points: PointCloud) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def fit_times(points: PointCloud, first: float, last: float) -> tuple[float, float]:
-    """Return the time of a beam at azimuth `first`, and the seconds per radian.
+    """Return the time at the azimuth `first`, and the time per radian, in seconds.
 
-    Times are in seconds since the stamp. Both values come from a straight line that is fitted to
-    the azimuths and times of the points. The azimuths are shifted by whole turns, so that most of
-    them are between `first` and `last`.
+    Times count from the stamp of the points.
     """
+    # Unwrapped azimuths may be whole turns away from `first` and `last`.
     azimuths, times = unwrap_azimuths(points)
     if len(azimuths) < 2:
         return 0.0, 0.0

@@ -1,10 +1,7 @@
 """Limit the duration and the size of scans, in case the end of a scan is missing.
 
-The duration of a scan, by the times of the packets, is limited to twice the duration of the slowest
-revolution. If the number of points of a scan is constant, its size is limited to twice this number.
-Otherwise its size is limited to `MAX_BYTES`, or on a serial line to the number of bytes that the
-line transmits in the maximum duration. If packets of a scan are missing, its end may be missing as
-well. Such a scan is limited to `MAX_GROWTH` times the number of packets of a whole scan.
+A scan takes at most twice the time of the slowest revolution, and has at most twice the number of
+points of a whole scan. If this number varies, the size in bytes is limited.
 """
 
 from __future__ import annotations
@@ -84,8 +81,8 @@ class ScanLimits:
             usual: the number of packets of a whole scan.
 
         Returns:
-            The row of this packet, or None; and which limit it exceeds: True for a limit of all
-            scans, False for the limit of scans with missing packets.
+            The row of this packet, or None; and whether the limit applies to all scans, not only to
+                scans with missing packets.
         """
         since = scan.since if scan.packets else packets.times.item(0)
         is_overdue = np.abs(packets.times - since) > self.longest_ns

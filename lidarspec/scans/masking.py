@@ -1,9 +1,7 @@
 """Find the masked sector of a rotating sensor, and mark the packets after it.
 
-The sector is found in the first revolutions of a stream. Packets are released at once until the
-angle leaps. The following packets are held until the leap recurs one revolution later, or until
-packets of all angles have arrived, so that the first scans are cut in the sector as well. No
-packets are held after a whole revolution without a leap, or after a sector was found.
+The sector is found in the first revolutions of a stream. If the angle leaps, packets are held for
+about one revolution, so that the first scans are cut in the sector as well.
 """
 
 from __future__ import annotations
@@ -38,7 +36,7 @@ class Masking:
     The packets have to be in order.
 
     Args:
-        sensor: the sensor that sends the packets; its `AngleReader.is_available` has to be true.
+        sensor: a sensor whose packets have an angle (`AngleReader.is_available`).
 
     Attributes:
         angle_before_sector: the angle of the last packet before the first marked packet, in turns;
@@ -70,10 +68,7 @@ class Masking:
         return self._finder.sector
 
     def push(self, packets: Packets) -> list[Packets]:
-        """Add packets, and return a list of the packets that can now be cut into scans.
-
-        The list has at most two batches.
-        """
+        """Add packets, and return a list of at most two batches of released packets."""
         if not len(packets):
             return []
         if self._is_settled:
@@ -106,11 +101,8 @@ class Masking:
         return self._release(None)
 
     def _hold_or_release(self, held: Packets) -> list[Packets]:
-        """Release or hold packets, and return a list of the released packets.
-
-        After a leap, the last packet before the leap and all later packets are held. Otherwise only
-        the last packet is held.
-        """
+        """Release or hold packets, and return a list of the released packets."""
+        # After a leap, the last packet before the leap and all later packets are held.
         self._held = [held]
         if self._is_settled:
             return self._release(None)

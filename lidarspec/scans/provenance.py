@@ -22,8 +22,7 @@ class PointOrigin(NamedTuple):
         host_ns: the arrival time of the frame, ns since 1970; 0 if unknown.
         part: the index of the part of the frame that contains the point; 0 if frames have no parts.
         number: the index of the point in the part, or in the frame if it has no parts.
-        data: the bytes of the frame. If the frame is encoded on the wire, these are the decoded
-            bytes that contain its fields (`Frame.wire`).
+        data: the bytes of the frame; for a frame that is encoded on the wire, the decoded bytes.
     """
 
     frame: str
@@ -73,11 +72,7 @@ class Provenance:
         return Provenance(self._runs, indices)
 
     def __call__(self, point: int) -> PointOrigin:
-        """Return the origin of a point, given its index in the scan.
-
-        Raises:
-            IndexError: if the index is out of range.
-        """
+        """Return the origin of a point, given its index in the scan."""
         size = sum(run.stop - run.start for run in self._runs)
         if self._indices is not None:
             size = len(self._indices)
@@ -96,7 +91,7 @@ class Provenance:
     def iter_packets(self) -> Iterator[Packets]:
         """Yield the packets that the points came from, in stream order.
 
-        A packet in which a scan ends belongs to both scans. After unpickling there are no packets.
+        After unpickling there are no packets.
         """
         for run in self._runs:
             first, last = first_points(run.points).searchsorted([run.start, run.stop - 1], "right")
@@ -127,13 +122,7 @@ def _find_origin(run: PointRun, point: int) -> PointOrigin:
 
 
 def find_part(packets: Packets, row: int, parts_before: int) -> int:
-    """Return the index of a part in its frame; 0 if the packets are whole frames.
-
-    Args:
-        packets: a batch of parts or of whole frames.
-        row: the row of the part in the batch.
-        parts_before: how many parts of the first frame were in earlier batches.
-    """
+    """Return the index of a part in its frame; 0 if the packets are whole frames."""
     _, rows = packets.frames
     if isinstance(rows, slice):
         return 0

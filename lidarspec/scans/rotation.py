@@ -1,11 +1,7 @@
 """Find the rows at which a rotating angle passes a given angle.
 
-`WrapDetector` is for an unknown direction of rotation, which `Rotation` finds from the angles.
-`PassDetector` is for a known direction, and also finds leaps over the given angle.
-
-Both classes decide about a row by this row and the rows before it, so that the division into
-batches does not change the result. An angle has to move away from the given angle before it can
-pass it again, so that jitter is not counted as a second pass.
+`WrapDetector` is for an unknown direction of rotation, and `PassDetector` for a known direction.
+The division of a stream into batches does not change their results.
 """
 
 from __future__ import annotations
@@ -26,12 +22,7 @@ FIRST_CHUNK_ROWS = 64
 
 
 class Rotation:
-    """Finds the direction in which an angle rotates.
-
-    Until the angle has moved by half a turn, the direction at a row is the direction from the first
-    angle to the angle of this row. Later, the direction reverses when the angle has moved back by
-    half a turn.
-    """
+    """Finds the direction in which an angle rotates."""
 
     def __init__(self) -> None:
         self._direction = 0
@@ -39,12 +30,10 @@ class Rotation:
         self._furthest = 0.0  # the largest total in the present direction, times that direction
 
     def push(self, steps: Floats) -> Floats:
-        """Return the direction at each of the next steps, 1 or -1, (k,).
-
-        If all directions are equal, the result has the shape (1,).
+        """Return the direction at each step, 1 or -1, (k,); (1,) if all are equal.
 
         Args:
-            steps: steps of the angle, in turns, (k,), at least one.
+            steps: one or more steps of the angle, in turns, (k,).
         """
         totals = steps.copy()
         totals[0] += self._total
@@ -56,12 +45,7 @@ class Rotation:
         return self._find_directions(totals)
 
     def _only_advances(self, total: float, steps: Floats) -> bool:
-        """Return whether new steps advance beyond the furthest angle, and never go back.
-
-        Args:
-            total: the turns from the start to the first new step.
-            steps: the other new steps, in turns.
-        """
+        """Return whether new steps advance beyond the furthest angle, and never go back."""
         if self._direction * total < self._furthest:
             return False
         return float((self._direction * steps).min(initial=0.0)) >= 0
@@ -72,6 +56,7 @@ class Rotation:
         Args:
             totals: the turns from the start to each row, (k,).
         """
+        # The direction reverses when the angle has moved back by half a turn.
         directions = np.empty(len(totals))
         start = 0
         size = FIRST_CHUNK_ROWS
@@ -100,11 +85,7 @@ class Rotation:
         return directions
 
     def _reverse(self, total: float) -> None:
-        """Reverse the direction, or set the first direction.
-
-        Args:
-            total: the turns from the start to the row at which the direction changes.
-        """
+        """Reverse the direction, or set the first direction."""
         if self._direction:
             self._direction = -self._direction
         elif total > 0:
@@ -160,8 +141,6 @@ class WrapDetector:
     ) -> NDArray[np.intp]:
         """Return the rows of the passes that jitter cannot have caused.
 
-        Before such a pass, the angle has been well away from the angle to pass (`_was_away`).
-
         Args:
             passed: the rows of all passes.
             behind: the angle at each row minus the angle to pass, from 0 to `full`, (k,).
@@ -181,10 +160,8 @@ class WrapDetector:
 class PassDetector:
     """Finds the rows at which an angle passes a given angle, or leaps over it.
 
-    All angles are in turns.
-
     Args:
-        at: the angle to pass.
+        at: the angle to pass, in turns.
         direction: 1 if angles grow, else -1.
     """
 
@@ -198,9 +175,9 @@ class PassDetector:
         """Detect passes of another angle from now on.
 
         Args:
-            at: the angle to pass.
+            at: the angle to pass, in turns.
             direction: 1 if angles grow, else -1.
-            angle: the angle of the previous row; None if there was no row.
+            angle: the angle of the previous row, in turns; None if there was no row.
         """
         self._at = at
         self._direction = direction
@@ -210,7 +187,7 @@ class PassDetector:
         """Return the rows at which the angle of this detector is passed.
 
         Args:
-            angles: the angles of the next rows, (k,).
+            angles: the angles of the next rows, in turns, (k,).
         """
         if not len(angles):
             return np.empty(0, np.intp)
@@ -246,10 +223,8 @@ def previous_values(values: Floats, first: float | None) -> Floats:
 
 
 def _reduce_to_turn(angles: Floats, full: float) -> Floats:
-    """Return angles modulo a whole turn, in [0, full), as a read-only array.
-
-    The result is the same as that of `np.mod`, but faster.
-    """
+    """Return angles modulo a whole turn, in [0, full), as a read-only array."""
+    # This is faster than `np.mod`, and has the same result.
     outside = np.flatnonzero((angles < 0) | (angles >= full))
     if not len(outside):
         return angles

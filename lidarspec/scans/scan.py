@@ -36,14 +36,14 @@ class Scan:
         whole: whether start, end and at least half of the packets have arrived.
         imu: the samples of the IMU from the first point up to the first point of the next scan;
             None without an IMU, or if its clock differs from the clock of the points.
-        host_ns: the arrival time of the packet with the first point, int64 ns since 1970 by the
-            clock of the computer; 0 if unknown.
+        host_ns: the arrival time of the packet with the first point, int64 ns since 1970; 0 if
+            unknown.
         beams: the default number of beams of `to_laserscan`; None to use the number that the sensor
             declares, or the number of points.
         frame_id: the name of the frame of reference in ROS messages.
-        number: the index of the scan in its file, if the file is read in pieces; else None.
-        mount: the position and rotation of the sensor on its carrier, if the points are in the axes
-            of the carrier; None if they are in the axes of the sensor.
+        number: the index of the scan in its file; None if the file is not read in pieces.
+        mount: the mount, if the points are in the axes of the carrier; None if they are in the axes
+            of the sensor.
         provenance: finds the frame that a point came from.
     """
 
@@ -108,8 +108,6 @@ class Scan:
     def to_arrow(self) -> Any:
         """Return the `pyarrow.Table` of the points, with `facts` in its metadata.
 
-        See `PointCloud.to_arrow`.
-
         Raises:
             UsageError: if pyarrow is not installed.
         """
@@ -138,9 +136,8 @@ class Scan:
 
         Args:
             beams: the number of angles; by default the attribute `beams`.
-            field: the first and the last angle, radians; by default a whole turn from -pi on. The
-                times of the beams are correct only if scans do not begin inside the field.
-                `PlanarScans` selects such a field.
+            field: the first and the last angle, radians; by default a whole turn from -pi on. If
+                scans begin inside the field, the times of the beams are wrong.
 
         Raises:
             UsageError: if `beams` is not a positive whole number.

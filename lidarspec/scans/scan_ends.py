@@ -1,8 +1,7 @@
 """Find the ends of scans by the sensor's declared rule.
 
 A rule reads a column of the points, a field of the packets, a field in an array of the packets, or
-the time. `EndFinder` returns each end as the index of the first point after the end. The module
-`cutter` ends the scans at these points.
+the time. `EndFinder` returns the first point after each end.
 """
 
 from __future__ import annotations
@@ -39,10 +38,8 @@ class ScanEnd(NamedTuple):
 
     Attributes:
         point: the index of the first point after the end.
-        packet: the row of the packet that shows the end, even if it has no points. None if a point
-            shows the end.
-        is_leap: whether the angle advances much more at this end than at the previous end. Packets
-            are then missing, or the value is not a valid angle.
+        packet: the row of the packet that shows the end; None if a point shows the end.
+        is_leap: whether the angle advances much more at this end than at the previous end.
     """
 
     point: int
@@ -51,11 +48,7 @@ class ScanEnd(NamedTuple):
 
 
 class EndFinder:
-    """Finds the ends of scans in one stream of points.
-
-    Args:
-        sensor: the sensor that sends the stream.
-    """
+    """Finds the ends of scans in one stream of points."""
 
     def __init__(self, sensor: SensorDescription) -> None:
         assert sensor.scan is not None  # every sensor with points declares it
@@ -74,9 +67,7 @@ class EndFinder:
         self._last_step = 0.0  # turns by which the angle advanced at the end before
 
     def use_sector(self, sector: Sector, angle: float | None) -> None:
-        """Cut scans in a masked sector from now on.
-
-        An angle that the user has configured for cuts stays in use.
+        """Cut scans in a masked sector, unless the user has configured an angle for cuts.
 
         Args:
             sector: the masked sector.
@@ -130,7 +121,6 @@ class EndFinder:
         """Return the angle at which scans are cut.
 
         Args:
-            rule: the sensor's rule, which has the default angle.
             full: a whole turn in the unit of the angle.
         """
         if self._cut is None:
@@ -146,13 +136,7 @@ class EndFinder:
     def _find_passes(
         self, passes: PassDetector, packets: Packets, points: EvaluatedPoints
     ) -> list[ScanEnd]:
-        """Return the scan ends at which the angle in a field passes the cut angle.
-
-        Args:
-            passes: detects passes of the cut angle.
-            packets: the packets.
-            points: the points of the packets.
-        """
+        """Return the scan ends at which the angle in a field passes the cut angle."""
         if isinstance(self._rule, OnWrap):
             path = _make_own_path(packets, self._rule.name)
             column = _read_field(points, path)
@@ -231,10 +215,8 @@ def _find_full_turn(packets: Packets, path: str) -> float | None:
 
 
 def _make_own_path(packets: Packets, path: str) -> str:
-    """Return the path of a field in the packets, given its path in the frame.
-
-    The paths differ if the packets are parts of a frame.
-    """
+    """Return the path of a field in the packets, given its path in the frame."""
+    # The paths differ if the packets are parts of a frame.
     _, _, parts = packets.frame.partition(".")
     if not parts:
         return path
@@ -261,10 +243,7 @@ def _is_per_packet(column: Column) -> bool:
 
 
 def _read_rows(column: Column, points: EvaluatedPoints) -> tuple[Floats, Indices]:
-    """Return the values of a field, and for each value the index of its first point.
-
-    Values are in stream order. Array elements without points are left out.
-    """
+    """Return the values of a field, and for each value the index of its first point."""
     levels = 1 + max(
         (index for index, name in enumerate(column.axes) if name is not None), default=-1
     )
@@ -296,11 +275,8 @@ def first_points(points: EvaluatedPoints) -> Indices:
 
 
 def _sum_axes(counts: NDArray[Any], axis_count: int) -> Indices:
-    """Return counts, summed over all axes after the first `axis_count` axes.
-
-    Along an axis with zero stride, all values are equal. The first value is multiplied by their
-    number, which is faster than a sum.
-    """
+    """Return counts, summed over all axes after the first `axis_count` axes."""
+    # Along an axis with zero stride, a product is faster than a sum.
     times = 1
     while counts.ndim > axis_count:
         if counts.strides[-1] == 0 and counts.shape[-1] > 0:

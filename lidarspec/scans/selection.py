@@ -1,12 +1,7 @@
 """Select scans of a source by time or index, and parts of each scan.
 
-A `Selection` describes the selected scans. A `ScanSelector` applies it to the scans of one stream
-as they arrive, and reports when all selected scans have passed. `iter_received` selects bytes by
-their arrival time.
-
-If a source can seek, most of the data before the selected times is skipped without reading it.
-Reading starts early enough for a whole scan before the first selected time, even if the clocks of
-sensor and host drift apart.
+A `Selection` describes the selected scans, and a `ScanSelector` applies it to the scans of one
+stream. `iter_received` selects bytes by their arrival time.
 """
 
 from __future__ import annotations
@@ -58,14 +53,13 @@ class Selection:
         scans: a pair (start, end) of indices; scans with start <= index < end are selected. Indices
             count from 0 and include incomplete scans. An end of None means no limit.
         every: the step between selected scans; 1 for all.
-        ranges: the lowest and the greatest range, metres. All other points become invalid; their
-            range is -inf if they are nearer, and inf if they are farther (REP-117).
-        returns: the return of each firing to keep: "first", "last", "strongest", or "all" for all
-            returns. It is chosen among the returns inside `ranges`.
+        ranges: the lowest and the greatest range, metres. Points outside become invalid, with the
+            range -inf if they are nearer, and inf if they are farther (REP-117).
+        returns: the return of each firing to keep: "first", "last", "strongest", or "all". It is
+            chosen among the returns inside `ranges`.
         columns: the names of the columns of the points, in this order; () for all columns.
-        time: the clock of the stamps and of `times`: "sensor"; "utc", which follows from the
-            sensor's clock if it has a date, otherwise from the arrival times (`UtcTimes`); or
-            "host" for the arrival time of the first packet of a scan.
+        time: the clock of the stamps and of `times`: "sensor"; "utc", by the sensor's clock or else
+            by the arrival times; or "host" for the arrival time of the first packet of a scan.
         beams: the default number of beams, see `Scan`.
         frame_id: the name of the frame of reference, see `Scan`.
 
@@ -108,19 +102,12 @@ class Selection:
 
     @property
     def is_counted(self) -> bool:
-        """Whether all scans have to be counted, from the first scan of the source.
-
-        This is the case if scans are selected by index, by time or by step.
-        """
+        """Whether scans are selected by index, time or step, and have to be counted."""
         return self.is_timed or self.scans != (0, None) or self.every != 1
 
     @property
     def needs_all_scans(self) -> bool:
-        """Whether all earlier scans are needed to select a scan or to find its time.
-
-        This is the case if `is_counted` is true, or if times are in UTC. A file is then not read in
-        pieces.
-        """
+        """Whether all earlier scans are needed to select a scan or to find its time."""
         return self.is_counted or self.time == "utc"
 
 
@@ -146,13 +133,7 @@ EVERYTHING = Selection()
 
 
 class TimeSlice:
-    """The selected times of one stream.
-
-    Attributes:
-        first: the first time of the stream, ns; None before it is known.
-        last: the newest time of the stream, ns; None before it is known.
-        ended: whether the end of the slice has passed, so that no later time is selected.
-    """
+    """The selected times of one stream."""
 
     def __init__(self, times: Times) -> None:
         self._times = times
@@ -184,8 +165,6 @@ class TimeSlice:
     def missed_error(self, source: object, number: str = "data") -> UsageError:
         """Return the error to raise if a source has no data at the selected times.
 
-        The error states the first and the last time of the source.
-
         Args:
             source: the name of the source.
             number: the amount of data in the source for the message, for example "12 scans,".
@@ -209,11 +188,8 @@ class TimeSlice:
         return (self.to_ns(self._times[0]) or 0) - (self.first or 0)
 
     def to_ns(self, moment: Moment | None) -> int | None:
-        """Return a limit of the slice in ns; None if there is no limit.
-
-        A limit in seconds counts from the first time of the stream. Returns None until this time is
-        known.
-        """
+        """Return a limit of the slice in ns; None without a limit."""
+        # A limit in seconds is unknown until the stream has a first time.
         if isinstance(moment, datetime):
             return round(moment.timestamp() * 1e6) * 1000
         if moment is None or self.first is None:
@@ -227,7 +203,7 @@ def format_date(ns: int) -> str:
 
 
 class PacketTimes:
-    """The times of packets of one type, by the clock that a selection names.
+    """Reads the times of packets of one type by the clock of a selection.
 
     Args:
         time: the clock, as in `Selection`.
@@ -299,8 +275,8 @@ class ScanSelector:
     Args:
         selection: the selection.
         source: the name of the source, for messages.
-        skip: a function that skips the data of the source that arrived before a time, ns since
-            1970, and returns whether it skipped data; None if the source cannot seek.
+        skip: a function that skips the data before an arrival time, in ns since 1970, and returns
+            whether it skipped data; None if the source cannot seek.
 
     Attributes:
         ended: whether all selected scans have passed.
@@ -329,9 +305,7 @@ class ScanSelector:
         return self._utc.warnings if self._utc is not None else []
 
     def iter_selected(self, scans: Iterable[Scan | None]) -> Iterator[Scan | None]:
-        """Yield the selected parts of selected scans.
-
-        None in the input stands for a scan that has not arrived in time. It is yielded unchanged.
+        """Yield the selected parts of selected scans, and each None in the input.
 
         Raises:
             UsageError: if there were scans, but none was selected.
@@ -383,10 +357,7 @@ class ScanSelector:
         return self._seen > 0 and not self._selected
 
     def make_missing_error(self) -> UsageError:
-        """Return the error to raise if no scan was selected.
-
-        The error states how many scans the source has, or at which times.
-        """
+        """Return the error to raise if no scan was selected."""
         if self._seen == 1:
             number = "1 scan"
         else:
@@ -401,11 +372,7 @@ class ScanSelector:
         )
 
     def _find_time(self, scan: Scan) -> int:
-        """Return the time of a scan by the selected clock, ns.
-
-        Raises:
-            UsageError: if it is unknown.
-        """
+        """Return the time of a scan by the selected clock, ns."""
         if self._selection.time == "utc":
             return self._find_utc(scan)
         by_host = self._selection.time == "host"

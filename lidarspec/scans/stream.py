@@ -1,8 +1,7 @@
 """Make scans from batches of packets as they arrive.
 
-Packets are sorted (`packets.reorder`). At a masked sector they are marked (`masking`). Their points
-are calculated and divided into scans (`cutter`). A `ScanStream` keeps the points of the scan that
-has not ended, and packets with points that depend on the next packets.
+`ScanStream` sorts the packets, calculates their points and divides the points into scans. It keeps
+the points of the scan that has not ended.
 """
 
 from __future__ import annotations
@@ -31,12 +30,7 @@ from lidarspec.spec.sensor import SensorDescription
 
 
 class ScanStart(NamedTuple):
-    """The start of a scan.
-
-    Attributes:
-        time_ns: the time of the first point of the scan, ns.
-        host_ns: the arrival time of the packet with the first point, ns; 0 if unknown.
-    """
+    """The start of a scan."""
 
     time_ns: int
     host_ns: int
@@ -48,8 +42,8 @@ class ScanStream:
     Args:
         sensor: the sensor that sends the packets.
         mount: the mount of the sensor; the scans are then in the axes of its carrier.
-        imu: the buffer of the sensor's IMU samples. Add samples before the packets that arrived
-            with them.
+        imu: the IMU samples of the sensor. Add samples to it before the packets that arrived with
+            them.
     """
 
     def __init__(
@@ -85,10 +79,7 @@ class ScanStream:
         return bool(self._runs) and not self._is_foreign
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state to pickle, without the points of the scan that has not ended.
-
-        The unpickled stream omits this scan.
-        """
+        """Return the state to pickle, without the points of the scan that has not ended."""
         is_foreign = self._is_foreign or bool(self._runs)
         return {**vars(self), "_runs": [], "_is_foreign": is_foreign}
 
@@ -120,10 +111,7 @@ class ScanStream:
         return self._add_marked(batches)
 
     def _add_marked(self, batches: list[Packets]) -> list[Scan]:
-        """Add packets, and return the scans that they complete.
-
-        The packets are sorted, and masked sectors are marked.
-        """
+        """Add sorted packets with marked sectors, and return the scans that they complete."""
         scans = list[Scan]()
         for packets in batches:
             if packets.masked is not None and not self._uses_sector:
@@ -145,10 +133,8 @@ class ScanStream:
         self._uses_sector = True
 
     def _take_parts_with_points(self, packets: Packets) -> Packets:
-        """Return `packets`, or their parts if the parts have the points.
-
-        The index of the parts has no gap for a frame without parts, because no packet is missing.
-        """
+        """Return `packets`, or their parts if the parts have the points."""
+        # The index of the parts has no gap for a frame without parts: no packet is missing.
         parts = packets.with_points
         if parts is not packets:
             rows = np.searchsorted(packets.index, parts.index)
@@ -164,10 +150,10 @@ class ScanStream:
         return parts
 
     def _evaluate(self, packets: Packets, *, final: bool) -> list[Scan]:
-        """Calculate the points of packets, and return the scans that they complete.
+        """Calculate the points of sorted packets, and return the scans that they complete.
 
         Args:
-            packets: the packets, sorted and marked.
+            packets: the packets.
             final: whether no packets follow.
         """
         self._waiting = None
@@ -210,7 +196,7 @@ class ScanStream:
     def _end_scan(
         self, following: ScanStart | None, *, whole: bool = False, complete: bool = False
     ) -> list[Scan]:
-        """End the current scan, and return it in a list; the list is empty without points.
+        """End the current scan, and return it in a list, which is empty without points.
 
         Args:
             following: the start of the next scan; None if unknown.
@@ -262,10 +248,9 @@ def _read_starts(
 ) -> list[ScanStart | None]:
     """Return the starts of the scans that begin at some points.
 
-    The start is None for an index after the last point.
-
     Args:
-        indices: the indices of the first points of scans in `points`, ascending.
+        indices: the indices of the first points of scans, ascending. For an index after the last
+            point, the result is None.
     """
     source = points.source
     known = [index for index in indices if index < source.size]
@@ -282,11 +267,7 @@ def _read_starts(
 def iter_scans(
     sensor: SensorDescription, batches: Iterable[Packets], imu: WaitingSamples | None = None
 ) -> Iterator[Scan]:
-    """Yield all scans of one stream.
-
-    Args:
-        imu: the IMU samples of the stream.
-    """
+    """Yield all scans of one stream."""
     stream = ScanStream(sensor, imu=imu)
     for batch in batches:
         yield from iter_released(stream.add(batch))
