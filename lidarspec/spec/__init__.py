@@ -4,8 +4,7 @@
     Sensor, Serial, Simulation, hookimpl, spread
 
 A plugin imports only from this package and from `lidarspec`. It makes a `Sensor` from the facts in
-a manual, and the `Sensor` is checked when it is made. All other packages use this description.
-Modules in reading order:
+a manual. Modules in reading order:
 
 * `description`: `Frame`, `Command`, `Simulation`, `Relative`, `Reported`.
 * `sensor`: `SensorDescription`, which combines these values. `Sensor`, in

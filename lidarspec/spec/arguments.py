@@ -1,10 +1,7 @@
 """Arguments of commands, and values that are filled in when a command is sent.
 
 An argument is a number in a range, a named number, a text, an address, a port or bytes. Each kind
-describes the values that it accepts, and converts them to bytes of the frame. `Count`, `Address`,
-`Port` and `Template` among the `values` of a command are placeholders. When the command is sent,
-they are replaced by a running number, by this computer's address or port, and by a text that
-contains other values.
+describes the values that it accepts, and converts them to bytes of the frame.
 """
 
 from __future__ import annotations
@@ -21,10 +18,7 @@ from lidarspec.errors import SpecError
 
 @dataclass(frozen=True)
 class Range:
-    """A number from `low` to `high`, in the unit of its field.
-
-    A plugin declares it by two numbers: ("motor.speed", 5, 15).
-    """
+    """A number from `low` to `high`, in the unit of its field."""
 
     low: float
     high: float
@@ -35,8 +29,7 @@ class Port(Range):
     """The UDP port to which the sensor sends its data.
 
     As an argument, it is a number. Among the `values` of a command, it is the port at which this
-    computer expects the data. A simulated sensor sends its data to this port, at the `Address` in
-    the same command.
+    computer expects the data.
     """
 
     low: float = 1
@@ -47,11 +40,11 @@ class Port(Range):
 class Choice(Range):
     """One of several numbers with names, for a field that several commands use.
 
-    An example is ``("number", Choice(cartesian=0, spherical=1))``. The argument is a name, or its
-    number. For a field that only one command uses, construct's `Enum` is used instead.
+    An example is ``("number", Choice(cartesian=0, spherical=1))``. The argument is a name or a
+    number.
 
     Raises:
-        SpecError: without names, or if the values are not different integers.
+        SpecError: if there are no names, or if the values are not different integers.
     """
 
     names: Mapping[str, int] = field(hash=False)
@@ -143,7 +136,7 @@ class Address:
 
 @dataclass(frozen=True)
 class Octets:
-    """Plain bytes. A plugin declares them by the type: ("key", bytes)."""
+    """Plain bytes, which a plugin declares by the type: ("key", bytes)."""
 
     def describe(self, field_size: int | None) -> str:
         """Return the accepted values as text, for messages."""
@@ -203,15 +196,14 @@ _SAFE_VALUE = r"[\w.~:+-]*"
 class Template:
     """A text in `Command.values` with names in braces, which are replaced by values.
 
-    An example is ``Template("/cmd/start?handle={handle}&port={own_port}")``. A name is a value
-    that an earlier reply provided (`Command.provides`), or an argument of the command that is
-    declared with the path of this field. `own_address` is this computer's address as seen by the
-    sensor, and `own_port` is the port at which this computer expects the data. Values consist of
-    ASCII letters, digits and ``_.~:+-``.
+    An example is ``Template("/cmd/start?handle={handle}&port={own_port}")``. A name is a value that
+    an earlier reply provided (`Command.provides`), or an argument that is declared with the path of
+    this field. `own_address` is this computer's address as seen by the sensor, and `own_port` is
+    the port at which this computer expects the data. Values consist of ASCII letters, digits and
+    ``_.~:+-``.
 
     Raises:
-        SpecError: if the text is not ASCII, contains no names, or has text in braces that is not a
-            name.
+        SpecError: if the text is not ASCII, contains no names, or has an invalid name in braces.
     """
 
     text: str
@@ -245,9 +237,6 @@ class Template:
 
     def fill(self, values: Mapping[str, Any]) -> bytes:
         """Return the text with the names replaced by values.
-
-        Args:
-            values: a text or a number for each name.
 
         Raises:
             ValueError: for a value with a character that is not allowed.
@@ -316,8 +305,7 @@ class Argument:
 def argument(given: Any) -> Argument:
     """Return the argument that a plugin declared as a tuple.
 
-    Examples are ("motor.speed", 5, 15), ("data.host", Address()), ("data.port", Port()), ("name",
-    Text(16)), ("type", Choice(plain=0, dual=1)) and ("key", bytes).
+    Examples are ("motor.speed", 5, 15), ("data.host", Address()) and ("key", bytes).
 
     Raises:
         SpecError: for an invalid declaration.

@@ -1,11 +1,8 @@
 """Find the bits of each value of a bit block by probing its parser.
 
-A block is any nesting of ``BitStruct``, ``ByteSwapped``, ``BitsSwapped`` and ``BytesInteger``. Each
-bit of a value is one bit of the block. To find out which, the block is parsed once for each digit
-of the binary indices of its bits: in the block for digit k, the bits are set whose index has digit
-k set. The bits at one position of a value then spell out the index of the bit of the block. The
-result is confirmed with random blocks. This module therefore needs no rules about the order of
-bits.
+A block is any nesting of ``BitStruct``, ``ByteSwapped``, ``BitsSwapped`` and ``BytesInteger``. The
+block is parsed with different bits set, and the parsed values show the position of each bit. This
+module therefore needs no rules about the order of bits.
 """
 
 from __future__ import annotations
@@ -113,6 +110,7 @@ def probe(parse: Parse, size: int) -> list[BitField] | None:
     if any(not isinstance(value, int) or value != 0 for value in base.values()):
         return None
     full = parse(b"\xff" * size)
+    # The values in the block for digit k contain digit k of the binary index of each of their bits.
     index_bits = (8 * size - 1).bit_length()
     patterns = [parse(_make_pattern(index_bit, size)) for index_bit in range(index_bits)]
     fields = list[BitField]()
@@ -141,13 +139,11 @@ def _make_pattern(index_bit: int, size: int) -> bytes:
 def _make_field(
     keys: tuple[str | int, ...], full: int, values: list[int], *, flag: bool
 ) -> BitField | None:
-    """Return the field with these values; None if they cannot be those of a field.
+    """Return the field that has these values in the probed blocks, or None.
 
     Args:
-        keys: the keys of the field.
         full: the value of the field if all bits of the block are set.
         values: the values of the field in the blocks of `_make_pattern`.
-        flag: whether the field is parsed as False or True.
     """
 
     def find_index(position: int) -> int:
@@ -170,9 +166,7 @@ def _make_field(
 
 
 def _iter_segments(targets: dict[int, int]) -> Iterator[Segment]:
-    """Yield the segments of a value: runs of bits in one byte.
-
-    The bits of a segment are consecutive in the block and in the value.
+    """Yield the segments of a value.
 
     Args:
         targets: for each bit of the block that belongs to the value, its position in the value.

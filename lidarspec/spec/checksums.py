@@ -1,13 +1,8 @@
 """Checksum algorithms as values, and the CRCs in common use by name.
 
 An algorithm is immutable and hashable, and equal to another algorithm with the same parameters. It
-is called with the bytes of one message. `make_single` returns a faster function.
-`lidarspec.frames.row_checksums` computes the checksums of many frames at once. `CRCS` has the
+is called with the bytes of one message. `make_single` returns a faster function. `CRCS` has the
 common CRCs, by the names of CRC catalogues.
-
-All registers of CRCs are in *wire order*, in which the low byte of the register is combined with
-the next byte of data. With `refin`, this is the usual reflected register. Without `refin`, it is
-the usual register, aligned left, with its bytes in reverse order.
 """
 
 from __future__ import annotations
@@ -56,7 +51,7 @@ class Checksum(ABC):
         """Return a short name to display, for example "XOR-8"."""
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        """Return the checksum of each row, (n,) uint64, by one call for each row.
+        """Return the checksum of each row, (n,) uint64.
 
         Args:
             rows: frames of one length, (n, size).
@@ -114,6 +109,9 @@ class Crc(Checksum):
     @cached_property
     def start(self) -> int:
         """The register before the first byte, in wire order."""
+        # In wire order, the low byte of the register is combined with the next byte of data. With
+        # `refin`, this is the usual reflected register. Without `refin`, it is the usual register,
+        # aligned left, with its bytes in reverse order.
         start = reflect(self.init, self.width)
         if self.refin:
             return start
@@ -172,8 +170,7 @@ class WordXor(Checksum):
     Args:
         head: the number of bytes at the start that form two-byte words.
         groups: the sizes of the following words, 1 or 2 bytes each. This sequence of sizes is
-            repeated. If the data ends after the first byte of a two-byte word, this byte is a word
-            of its own.
+            repeated. A single byte at the end is a word.
 
     Raises:
         ValueError: for invalid sizes.
@@ -218,9 +215,8 @@ class WordXor(Checksum):
 class Fold15(Checksum):
     """A 15-bit sum, which is doubled before each word is added.
 
-    The words are little-endian. At the end, the bits above bit 14 are added to the low 15 bits. If
-    the length is odd, a zero byte is appended. Bits that are shifted past bit 29 are lost, so only
-    the last 30 words count.
+    The words are little-endian. If the length is odd, a zero byte is appended. At the end, the bits
+    above bit 14 are added to the low 15 bits.
 
     Source: lidars of many vacuum cleaners; confirmed by captures of two makes.
     """
@@ -230,6 +226,7 @@ class Fold15(Checksum):
     def __call__(self, data: Bytes) -> int:
         odd = len(data) % 2
         total = 0
+        # Bits above bit 29 are lost, so only the last 30 words count.
         for (word,) in struct.iter_unpack("<H", bytes(data[odd - 60 :]) + bytes(odd)):
             total = (total << 1) + word
         return (total & 0x7FFF) + (total >> 15) & 0x7FFF
@@ -266,10 +263,10 @@ class Fletcher(Checksum):
 
 @dataclass(frozen=True)
 class ZeroPadded(Checksum):
-    """Applies another algorithm to the data, after padding the data with zeros.
+    """Applies another algorithm to data that is padded with zeros to whole words.
 
-    The data is padded to a multiple of `to` bytes, for checksums of hardware that processes whole
-    words.
+    Args:
+        to: the size of a word in bytes.
     """
 
     algorithm: Checksum
@@ -300,10 +297,7 @@ def _require(checksum: Checksum, **allowed: range | tuple[object, ...]) -> None:
 
 
 def _xor(data: Bytes) -> int:
-    """Return the XOR of all bytes.
-
-    The data is converted to one large integer, whose halves are XORed until one byte is left.
-    """
+    """Return the XOR of all bytes."""
     value = int.from_bytes(data, "little")
     for power in _list_shifts(8, len(data)):
         value ^= value >> power
@@ -312,13 +306,9 @@ def _xor(data: Bytes) -> int:
 
 @lru_cache(maxsize=4096)
 def _list_shifts(bits: int, count: int) -> tuple[int, ...]:
-    """Return the shifts to combine all parts of an integer by XOR.
+    """Return the shifts to combine `count` parts of `bits` bits by XOR.
 
     After ``number ^= number >> shift`` for each shift, the lowest part is the XOR of all parts.
-
-    Args:
-        bits: the size of a part.
-        count: the number of parts.
     """
     return tuple(bits << power for power in reversed(range(max(count - 1, 0).bit_length())))
 
@@ -479,10 +469,7 @@ def _compute_wide_crc(algorithm: Crc, table: tuple[int, ...], register: int, dat
 
 @lru_cache(maxsize=256)
 def _make_single_word_xor(algorithm: WordXor) -> Single:
-    """Return a fast function that computes a `WordXor`.
-
-    The function XORs groups of words, and then splits the result into words.
-    """
+    """Return a fast function that computes a `WordXor`."""
     head = algorithm.head
     groups = algorithm.groups
     size = sum(groups)

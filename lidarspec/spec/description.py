@@ -1,8 +1,4 @@
-"""The frame types and commands of a sensor, and facts for its simulation, as values.
-
-All values are immutable, and are checked when they are made. `spec.sensor` combines them into a
-`SensorDescription`.
-"""
+"""The frame types and commands of a sensor, with facts for its simulation."""
 
 from __future__ import annotations
 
@@ -230,11 +226,7 @@ class Frame:
 
     @property
     def max_struct_bytes(self) -> int:
-        """The maximum size of the struct in bytes.
-
-        With a wire form, this is more than the maximum length of the encoded frame, because two
-        characters can encode a number of eight bytes.
-        """
+        """The maximum size of the struct in bytes."""
         if self.wire is None:
             return self.max_length
         return self.max_length * 4
@@ -356,10 +348,7 @@ class Command:
 
     @property
     def fixed(self) -> Mapping[str, Any]:
-        """The values that are the same in every frame, by path.
-
-        All values are fixed except for arguments and values that are filled in.
-        """
+        """The values that are the same in every frame, by path."""
         taken = {*self.filled, *(one.path.partition("[")[0] for one in self.arguments.values())}
         return {path: value for path, value in self.values.items() if path not in taken}
 

@@ -1,8 +1,4 @@
-"""Values of enum fields: the number on the wire, with its name.
-
-In a parsed frame, the value of a field with construct's `Enum` is an `EnumValue`. It behaves as a
-number, so that programs can compare it and build frames from it. Only its text shows the name.
-"""
+"""Values of enum fields: the number on the wire, with its name."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Additions to construct for units, checksums, sizes and parts of variable size.
 
-They are ordinary members of a struct and can be nested in any construct. They do not change the raw
-integers of a frame. Units are texts.
+The additions are members of a struct, and can be nested in any construct.
 """
 
 from __future__ import annotations
@@ -69,10 +68,7 @@ _FACTORS: dict[str, dict[str, Fraction]] = {
 
 
 def factor(unit: str, target: str) -> Fraction | None:
-    """Return the factor that converts values in `unit` to `target`.
-
-    Returns None if they measure different quantities.
-    """
+    """Return the factor from `unit` to `target`; None for different quantities."""
     if unit == target:
         return Fraction(1)
     return _FACTORS.get(target, {}).get(unit)
@@ -143,8 +139,7 @@ def parse_share(text: str) -> float:
 class Scaled(layer.DescribedField):
     """A number with a unit: ``physical = raw * scale + offset``.
 
-    The field parses and builds the raw number. Scale and unit are applied only if physical values
-    are requested.
+    The field parses and builds the raw number.
 
     Args:
         subcon: a construct field that parses to a number.
@@ -297,11 +292,7 @@ class Checksummed(layer.SealedStruct):
 
     @property
     def _measured_struct(self) -> Construct:
-        """The struct, which adds the offsets of its members to the parsed value.
-
-        In a frame, the engine has already prepared the struct. A struct that is used without a
-        frame is prepared here.
-        """
+        """The struct, prepared to add the offsets of its members to parsed values."""
         if isinstance(layer.unwrap(self.subcon), layer.MeasuredStruct):
             return self.subcon
         return layer.prepare(self.subcon)
@@ -376,10 +367,7 @@ class Checksummed(layer.SealedStruct):
         return self._find_field(name).parse(bytes(8 * layer.bit_width(self._find_field(name))))  # type: ignore[no-any-return]
 
     def _find_span(self, obj: Any, name: str) -> tuple[int, int]:
-        """Return the byte range of a field in the parsed stream, given its dotted name.
-
-        The range of a bit field includes all bytes that contain its bits.
-        """
+        """Return the byte range of a field in the parsed stream, given its dotted name."""
         con = self._measured_struct
         parts = name.split(".")
         for depth, part in enumerate(parts):
@@ -486,8 +474,8 @@ class Parts(layer.Partition):
     def _make_size_rule(self, context: Any, path: str) -> Callable[[layer.ParsedParts], int]:
         """Return a function that calculates the size of the next part.
 
-        The argument of the function is the list of the parsed parts. The result is a size in bytes,
-        0 if no part follows, or -1 if the struct of the next part determines the size.
+        The function takes the list of the parsed parts. It returns a size in bytes, 0 if no part
+        follows, or -1 if the struct of the next part determines the size.
         """
         rules = ((self.count, "count"), (self.size, "length"), (self.within, "length"))
         bounds = (
@@ -574,7 +562,7 @@ class Parts(layer.Partition):
         """Build a part as the first kind that accepts its values.
 
         Returns:
-            The kind, the value and the bytes of the part.
+            The kind, the value and the bytes.
         """
         faults = list[ConstructError]()
         for name, case in self.cases.items():

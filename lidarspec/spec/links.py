@@ -1,4 +1,4 @@
-"""The declared connections of a sensor. The package `transports` opens them."""
+"""The declared connections of a sensor, which the package `transports` opens."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Read the accepted values of a sensor's options from annotations.
 
-The `configure` function of a plugin declares its options as keyword parameters. The annotations of
-the parameters, such as ``Literal["cm", "mm"]``, ``int | None`` or ``str | Path | Learned``,
-determine the accepted values.
+The `configure` function of a plugin declares its options as keyword parameters with annotations,
+such as ``Literal["cm", "mm"]``, ``int | None`` or ``str | Path | Learned``.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """Return values of a sensor's `points` function: columns of a batch of packets.
 
-The engine converts them to a `PointCloud`: it flattens the columns, and computes coordinates and
-masks by REP-103 and REP-117. Columns are in metres, radians and seconds. Azimuth is
-counter-clockwise from the manual's zero direction, and elevation is measured from the horizon. A
-range of 0 means no return.
+Columns are in metres, radians and seconds. Azimuth is counter-clockwise from the manual's zero
+direction, and elevation is measured from the horizon. A range of 0 means no return.
 """
 
 from __future__ import annotations

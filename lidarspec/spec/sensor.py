@@ -1,9 +1,7 @@
 """The facts of a sensor's manual as fields of a `SensorDescription`.
 
-A description is immutable. When it is made, it checks that its facts are consistent. The packages
-`frames`, `framing`, `points`, `packets` and `scans` work from a description. Plugins and users make
-a `lidarspec.Sensor`, which is the subclass with methods that call these packages (see
-`sensor_operations`).
+A description is immutable, and is checked when it is made. Plugins and users make its subclass
+`lidarspec.Sensor`, which has methods to decode, build and so on.
 """
 
 from __future__ import annotations
@@ -129,11 +127,11 @@ class SensorDescription:
     def data_frame(self) -> str:
         """The name of the frame type with the points.
 
-        If there are several such types, it is the one that the option `answer` selects, or the
+        If several frame types have points, the option `answer` selects one; the default is the
         first.
 
         Raises:
-            UsageError: for a sensor without points. The error lists its frame types.
+            UsageError: for a sensor without points.
             UnknownFrame: for a sensor whose frame types are unknown until it is configured with a
                 file.
         """
@@ -162,7 +160,7 @@ class SensorDescription:
         return bool(self.data_frames) or not self.frames
 
     def require_points(self) -> None:
-        """Raise UsageError for a sensor without points. The error lists its frame types."""
+        """Raise UsageError for a sensor without points."""
         if not self.has_points:
             example = next(iter(self.incoming), "")
             raise UsageError(
@@ -224,8 +222,7 @@ class SensorDescription:
             frame: the name of a frame type, or "name.path" for the parts of a frame.
 
         Raises:
-            SpecError: if the frame type has no such function. The error lists the frame types that
-                have one.
+            SpecError: if the frame type has no such function.
         """
         name, _, parts = frame.partition(".")
         function = self.frames[name].imu
@@ -244,8 +241,7 @@ class SensorDescription:
         """Return the path of the parts of a frame that have a `points` or `imu` function.
 
         Returns:
-            The path; "" if the frame itself has the function, or if the sensor does not have the
-            frame type.
+            The path; "" if the frame itself has the function, or if the frame type is unknown.
         """
         if frame not in self.frames:
             return ""
@@ -305,8 +301,7 @@ class SensorDescription:
 def with_frames(sensor: _Sensor, frames: Mapping[str, Frame]) -> _Sensor:
     """Return a copy of a sensor with only these frame types.
 
-    The copy has no commands, no `state` and no `info`. Its clock has no `reference` and no `status`
-    if their frame types are missing.
+    The copy has no commands, no `state` and no `info`.
     """
     clock = sensor.clock
     if clock is not None and clock.reference is not None and clock.reference[0] not in frames:
@@ -342,11 +337,7 @@ def _check_sensor(sensor: SensorDescription) -> None:
 
 
 def _check_reported(sensor: SensorDescription, name: str) -> None:
-    """Raise `SpecError` if the port of a link cannot be a reported port.
-
-    The link must be the data link, and a command in `on_open` over another link must provide the
-    port.
-    """
+    """Raise `SpecError` if the sensor cannot report the port of a link."""
     if name != "data" or not any(
         sensor.commands[opening].provides and sensor.commands[opening].link != "data"
         for opening in sensor.on_open
@@ -498,10 +489,7 @@ def _check_clock(sensor: SensorDescription) -> None:
 def _check_names(
     sensor: SensorDescription, path: str, names: Iterable[str | None], table: Mapping[str, Any]
 ) -> None:
-    """Raise `SpecError` for the first name that is not in a table; None is allowed.
-
-    A sensor whose frame types are unknown until it is configured with a file is not checked.
-    """
+    """Raise `SpecError` for the first name that is not in a table; None is allowed."""
     for name in names:
         if name is not None and name not in table and sensor.frames:
             raise SpecError(

@@ -1,11 +1,4 @@
-"""Declarations about the clock, the packet counter and the scans of a sensor.
-
-A `Clock` declares how the time of a packet is read, and from which epoch it counts (`EPOCHS`). Many
-sensors also send the state of their clock. A `ClockStatus` declares the field with the state, and
-the meaning of its values.
-
-A function of a clock can call `unix_time` to convert the fields of a date.
-"""
+"""Declarations about the clock, the packet counter and the scans of a sensor."""
 
 from __future__ import annotations
 
@@ -99,8 +92,7 @@ class OnJump:
     Args:
         name: a field path. Steps of an angle are measured in the shorter direction around the
             circle.
-        by: the smallest step, in either direction, that ends a scan, in the unit of the field. It
-            has to be larger than all steps within a scan.
+        by: the smallest step, in either direction, that ends a scan, in the unit of the field.
     """
 
     name: str
@@ -176,10 +168,7 @@ class ClockStatus:
         object.__setattr__(self, "states", MappingProxyType(dict(self.states)))
 
     def state_of(self, value: float) -> ClockState:
-        """Return the state for a value.
-
-        For a value that is not declared, `locked` is None.
-        """
+        """Return the state for a value; `locked` is None if the value is not declared."""
         if value in self.states:
             return self.states[int(value)]
         return ClockState("unknown" if value != value else f"unknown value {value:g}")

@@ -68,19 +68,17 @@ def to_exact(number: float | int) -> Fraction:
 class Adapter:
     """Functions that convert between the raw values of a field and decoded values.
 
-    They represent construct's ExprAdapter, or a text. A parsed frame has the decoded values.
-    Columns have the raw bytes if `dtype` is uint8, else the decoded values.
+    Parsed frames have the decoded values.
 
     Attributes:
-        decode: a function that decodes an integer, or the bytes of the field.
-        encode: a function that encodes a value, given the value and the size of the field in bytes.
+
+        encode: a function of a value and the size of the field in bytes.
         dtype: the dtype of a column; uint8 if columns have the raw bytes.
-        allowed: the raw values that can be decoded; None if all values can be decoded, or if this
-            is known only after calling `decode`.
+        allowed: the raw values that can be decoded; None if there is no list.
         is_partial: whether a frame can be invalid because a raw value cannot be decoded.
         form: a text that describes how the value is stored; "" for a plain number.
-        decode_bytes: a function that decodes an array of bytes along the last axis, for columns of
-            decoded bytes; None if columns have the raw bytes or other values.
+        decode_bytes: a function that decodes an array of bytes along the last axis; None if columns
+            do not have decoded bytes.
     """
 
     decode: Callable[[Any], Any]
@@ -126,10 +124,7 @@ class Adapter:
 def _find_distinct(
     raw: NDArray[Any], *, is_bytes: bool
 ) -> tuple[list[Any], NDArray[np.intp], tuple[int, ...]]:
-    """Return the distinct values of a column, an index array, and the column's shape.
-
-    The index array has, for each value of the column, its index among the distinct values.
-    """
+    """Return the distinct values, the index of each value among them, and the shape."""
     if not is_bytes:
         values, where = np.unique(raw, return_inverse=True)
         return values.tolist(), where.reshape(-1), raw.shape
@@ -154,11 +149,10 @@ class FieldInfo:
         dtype: the dtype of the raw value in native byte order; None if only construct can read it.
         kind: "int", "float", "bytes" or "other".
         scale, offset, unit: ``physical = raw * scale + offset``, in this unit.
-        docs: the documentation of the field in the plugin.
+
         bits: the width in bits; 0 if the width is not fixed.
         const: the value that the field must have; None if any value is valid.
-        allowed: the raw values that the field may have (construct's OneOf, NoneOf and Mapping), in
-            ascending order; None for any value.
+        allowed: the raw values that the field may have, in ascending order; None for any value.
         rebuilt: the formula of the value in a built frame (construct's Rebuild); None if the caller
             supplies the value.
         default: the raw value that `build` uses if the caller supplies no value, or the formula of
@@ -299,9 +293,8 @@ class Ref:
     """A reference to the raw value of an earlier field.
 
     Attributes:
-        path: the path from the top of the frame. If it has no indices, it refers to the field in
-            the current element of each array.
-        info: the field.
+        path: the path from the top of the frame. A path without indices refers to the current
+            element of each array.
     """
 
     path: str
@@ -325,10 +318,7 @@ class Op:
 
 @dataclass(frozen=True, eq=False)
 class Untraced:
-    """An expression that cannot be converted to a formula.
-
-    An example is a Python function with branches. If a struct contains such an expression,
-    construct reads its frames one at a time.
+    """An expression that cannot be a formula, such as a function with branches.
 
     Attributes:
         reason: the reason, preceded by the path of the field with the expression.
@@ -367,10 +357,7 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
 
 
 def calculate(symbol: str, *args: Formula) -> Formula:
-    """Return an operation as a formula.
-
-    If all arguments are numbers, a sum, difference or product is computed instead.
-    """
+    """Return an operation as a formula."""
     if all(isinstance(arg, int) for arg in args) and symbol in ("+", "-", "*"):
         return int(_OPERATIONS[symbol](*args))
     return Op(symbol, args)
@@ -380,11 +367,10 @@ def evaluate(formula: Formula, read: Read) -> Any:
     """Return the value of a formula.
 
     Args:
-        read: a function that returns the value of a field, or None for a field that the frame does
-            not have.
+        read: a function that returns the value of a field, or None for a missing field.
 
     Raises:
-        Exception: any exception of an operation on these values.
+        Exception: if an operation fails, for example a division by 0.
     """
     match formula:
         case Ref():
@@ -441,8 +427,8 @@ def write(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str
 
     Args:
         named: a function that returns the text of a field.
-        operations: how the language writes operations that differ from Python, by Python's symbol.
-            A text has "{}" for each argument.
+        operations: a text with "{}" for each argument, by Python's symbol, for each operation that
+            the language writes in its own way.
 
     Raises:
         ValueError: if a part of the formula is `Untraced`.
@@ -465,12 +451,10 @@ def write(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str
 
 
 def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
-    """Return the description of a field in one element of some arrays.
-
-    Returns None if the field is not inside all these arrays.
+    """Return a field in one element of arrays; None if it is outside of an array.
 
     Args:
-        info: the description of the field in all elements.
+        info: the field in all elements.
         path: the path with the indices.
         indices: the index of the element in each array, by the axis of the array.
     """
@@ -484,10 +468,7 @@ def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> Field
 
 
 def fraction_in(formula: Formula) -> str | float | None:
-    """Return the first "/" or float in a formula; None if the formula has neither.
-
-    The value of a formula with one of them may be a fraction.
-    """
+    """Return the first "/" or float in a formula; None if the formula has neither."""
     for part in iter_subformulas(formula):
         if isinstance(part, float):
             return part
@@ -568,7 +549,6 @@ class Number:
     """An integer or float of whole bytes.
 
     Attributes:
-        info: the field.
         size: the size in bytes.
         kind: "uint", "int" or "float".
         order: the byte order, "little" or "big".
@@ -598,9 +578,8 @@ class Ending:
     """The end of bytes of variable size: a mark, or the end of the datagram.
 
     Attributes:
-        size: a field for the number of bytes before the end, to which formulas refer.
+        size: the field that formulas use for the number of bytes before the end.
         mark: the bytes of the mark, such as a terminator; b"" if the bytes end with the datagram.
-            The offset of a mark of n bytes is a multiple of n.
         mask: the bits of each byte that are compared with the mark.
         is_content: whether the mark belongs to the content, as in a number of variable size.
     """
@@ -633,12 +612,10 @@ class Ending:
 class Blob:
     """Plain bytes, which may be constant.
 
-    Only constant bytes may have no name.
-
     Attributes:
         size: the number of bytes, without the terminator.
         const: the bytes; None if any bytes are allowed.
-        ending: the mark that ends the bytes; None if a formula gives their number.
+        ending: the mark that ends the bytes; None if there is no mark.
     """
 
     name: str
@@ -653,8 +630,7 @@ class Part:
     """One integer of a block.
 
     Attributes:
-        info: the field.
-        bits: the bits of the block that contain it.
+        bits: the bits of the block that contain the integer.
         names: the names that lead from the block to the integer, such as ("distance",); () if the
             block is a single integer.
         indices: the index of the integer in each array inside the block.
@@ -670,12 +646,9 @@ class Part:
 class Block:
     """Bytes that contain one or more integers as bits.
 
-    A block with a single part without names is an integer with an unusual width or byte order.
-
     Attributes:
         info: a description of the whole block as a field.
         size: the size in bytes.
-        parts: the integers.
     """
 
     name: str
@@ -690,7 +663,6 @@ class Struct:
 
     Attributes:
         path: the path of the struct; "" for the frame itself.
-        docs: the documentation of the struct in the plugin.
     """
 
     name: str
@@ -753,8 +725,7 @@ class Repeat:
     """An array of `count` elements.
 
     Attributes:
-        axis: the name of the axis. This is the path of the array. In an array of arrays, each inner
-            level appends "[]".
+        axis: the path of the array, with "[]" appended for each inner level of nested arrays.
     """
 
     name: str
@@ -771,12 +742,11 @@ class Kind:
     Attributes:
         name: the name of the kind; "" if all parts are of one kind.
         element: the part, with paths from the top of the frame.
-        root: the part as a frame of its own. The path of a field of the outer frame starts with
-            "_.".
-        following: the formula of the size of the next part in bytes, by fields of `root`; 0 after
-            the last part. None if parts do not declare the size of the next part.
-        until: a condition that only the last part meets (construct's RepeatUntil), by fields of
-            `root`; None without such a condition.
+        root: the part as a frame of its own. Fields of the outer frame have paths with "_.".
+        following: the size of the next part in bytes, as a formula of `root`; 0 after the last
+            part; None if not declared.
+        until: a condition that only the last part meets, as a formula of `root`; None if not
+            declared.
     """
 
     name: str
@@ -798,9 +768,8 @@ class PartSequence:
             else None.
         within: the total size of all parts in bytes; None if it is not declared.
         outer: the fields of the outer frame that formulas of the parts use.
-        total: a field for the total size of all parts, to which later formulas refer.
-        is_array: whether the parts are the elements of an array that differ in size. The fields of
-            the elements are then columns of the outer frame.
+        total: the field that later formulas use for the total size of all parts.
+        is_array: whether the parts are the elements of an array that differ in size.
     """
 
     name: str
@@ -816,8 +785,7 @@ class PartSequence:
     def following(self, kind: Kind) -> Formula | None:
         """Return the size of the part that follows a part of this kind, as a formula.
 
-        The paths in the formula start at the top of the frame. Returns None if parts do not declare
-        the size of the next part.
+        Returns None if parts do not declare the size of the next part.
         """
         if kind.following is None:
             return None
@@ -836,10 +804,7 @@ class When:
 
 @dataclass(frozen=True, eq=False)
 class Select:
-    """A node for each value of a key, and a node for all other values.
-
-    The values are integers, unless the key is `Untraced`.
-    """
+    """A node for each value of a key, and a node for all other values."""
 
     name: str
     key: Formula
@@ -872,10 +837,7 @@ class Check:
 class Derived:
     """A value of a parsed frame that has no bytes of its own.
 
-    `build` ignores it.
-
     Attributes:
-        info: the value as a field.
         kind: "computed" for a value computed from other fields (construct's Computed), "offset" for
             its own offset in the frame (Tell), "size" or "bytes" for the size or the bytes of an
             earlier part (RawCopy), "peeked" for the value of the following bytes (Peek).
@@ -910,11 +872,9 @@ class Opaque:
     """A part that only construct can read.
 
     Attributes:
-        info: the part as a field.
-        kind: the name of its construct class, which may be a class of the plugin.
-        reason: why it cannot be converted to another node.
-        inside: the nodes inside the part, if it is a bit block or a struct. These nodes have no
-            offsets.
+        kind: the name of its construct class.
+        reason: why the part cannot be converted to another node.
+        inside: the nodes inside a bit block or a struct, without offsets.
         size: the size in bytes; None if it depends on the content.
         form: how the value is stored, as text to display.
         in_bits: whether the part is a bit block.
@@ -996,7 +956,7 @@ def formulas(node: Node) -> tuple[Formula, ...]:
 def size(node: Node) -> Formula | None:
     """Return the size of a node in bytes as a formula of header fields.
 
-    Returns None if only construct can determine it.
+    Returns None if only construct can determine the size.
     """
     match node:
         case Blob() if node.ending is not None:
@@ -1044,10 +1004,7 @@ def sum_sizes(sizes: Iterable[Formula | None]) -> Formula | None:
 
 
 def combine(symbol: str, one: Formula | None, other: Formula | None) -> Formula | None:
-    """Return a sum, difference or product in its simplest form.
-
-    Returns None if an operand is None.
-    """
+    """Return a simplified sum, difference or product; None if an operand is None."""
     if one is None or other is None:
         return None
     neutral = 1 if symbol == "*" else 0
@@ -1079,11 +1036,7 @@ def _sum_alternatives(cases: Sequence[tuple[Formula, Formula | None]]) -> Formul
 
 
 def infos(node: Node) -> tuple[FieldInfo, ...]:
-    """Return the fields of a node, without the fields of the nodes below it.
-
-    The integers in a block are not nodes, so the block returns their fields. Structs, arrays and
-    choices return no fields.
-    """
+    """Return the fields of a node, without the fields of the nodes below it."""
     match node:
         case Number() | Blob() | Opaque():
             return (node.info,)
@@ -1095,12 +1048,10 @@ def infos(node: Node) -> tuple[FieldInfo, ...]:
 class Scope:
     """Replaces construct's context when an expression is traced.
 
-    Each field before the expression is a `Symbol`, which records the operations on it.
-
     Args:
         parent: the context of the outer struct, which is "_" in expressions.
         path: the path of the struct.
-        asked: a list; each field that an expression reads is appended to it.
+        asked: a list to which each field that an expression reads is appended.
     """
 
     def __init__(self, parent: Scope | None, path: str, asked: list[Ref]) -> None:
@@ -1153,11 +1104,7 @@ class Scope:
 
 
 class RawCopyScope(Scope):
-    """The context of the value of a construct RawCopy.
-
-    It has names for the bytes and the offsets of the value. All other names are looked up in the
-    outer context.
-    """
+    """The context of the value of a construct RawCopy."""
 
     def __init__(self, scope: Scope | None, path: str, asked: list[Ref]) -> None:
         super().__init__(scope, path, asked)
@@ -1198,10 +1145,7 @@ class Value:
 
 
 class OuterScope(Scope):
-    """The context of the outer frame for expressions in a part.
-
-    It has the symbols of the outer frame, with "_." before their paths.
-    """
+    """The context of the outer frame for expressions in a part."""
 
     def __init__(self, scope: Scope, asked: list[Ref]) -> None:
         super().__init__(None, f"_.{scope.path}".rstrip("."), asked)

@@ -1,8 +1,7 @@
 """Functions that `points` functions can call, in addition to NumPy's ufuncs.
 
-They handle angles, the order of values in the stream, and tables. The functions accept NumPy arrays
-and the columns that the engine passes to `points`. For a column, they take the borders of packets
-and lost packets into account. A NumPy array is treated as one sequence of values.
+The functions accept NumPy arrays and the columns that the engine passes to `points`. They take lost
+packets into account only for columns.
 """
 
 from __future__ import annotations
@@ -28,8 +27,6 @@ ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_i
 
 class AlongAxis(NDArrayOperatorsMixin):
     """Numbers for the elements of an array of the frame, the same in all packets.
-
-    They can be combined with each other and with columns by NumPy's ufuncs.
 
     Attributes:
         axes: the names of the arrays; each is a whole path, or the last name of a path.
@@ -72,10 +69,7 @@ class AlongAxis(NDArrayOperatorsMixin):
         )
 
     def apply_function(self, function: Callable[..., Any], *values: Any) -> Any:
-        """Align the values by the names of their arrays, and apply a function to them.
-
-        If a column is among the values, its own `apply_function` is called.
-        """
+        """Align the values by the names of their arrays, and apply a function to them."""
         for value in values:
             if hasattr(value, "apply_function") and not isinstance(value, AlongAxis):
                 return value.apply_function(function, *values)
@@ -98,8 +92,6 @@ class AlongAxis(NDArrayOperatorsMixin):
 
     def align(self, names: tuple[str, ...]) -> NDArray[Any]:
         """Return the numbers with one axis for each name.
-
-        An axis has the length 1 if the numbers are the same for all elements of its array.
 
         Args:
             names: for each axis of the result, the last name in the path of its array. The names
@@ -327,10 +319,7 @@ def row_numbers(index: NDArray[Any], rows: int) -> NDArray[np.intp]:
 
 
 class TableLookup:
-    """A function that returns the entries of a table, (m,), at indices.
-
-    The result is nan for an index that is out of range.
-    """
+    """Looks up entries of a table, (m,); nan for an index that is out of range."""
 
     def __init__(self, entries: Any) -> None:
         self.entries = entries

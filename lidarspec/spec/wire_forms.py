@@ -2,11 +2,7 @@
 
 A wire form encodes and decodes one frame at a time. `find_end` finds the end of an encoded frame,
 `decode` converts it to the bytes of the struct, and `encode` converts the bytes of the struct to
-the encoded frame. All other packages use the bytes of the struct, as for binary frames.
-
-The fields of a text often depend on earlier fields, for example on counts. `decode` therefore
-repeatedly requests the next runs of fields, given the bytes that it has decoded so far. A run is
-one text field, or consecutive numbers, whose digits NumPy converts together.
+the encoded frame.
 """
 
 from __future__ import annotations
@@ -127,10 +123,7 @@ class NumberRun:
 
     @cached_property
     def _word_offsets(self) -> Offsets:
-        """The offset of each byte of the run in an array of big-endian 8-byte words.
-
-        Each number is one word.
-        """
+        """The offset of each byte if each number is a big-endian word of 8 bytes."""
         significance = np.where(
             self.is_little[self.owners],
             self.sizes[self.owners] - 1 - self.remaining,
@@ -139,10 +132,7 @@ class NumberRun:
         return 8 * self.owners + 7 - significance
 
     def to_bytes(self, values: Values) -> bytes:
-        """Return the first numbers of the run as bytes of the struct.
-
-        Bits that do not fit into a number are lost.
-        """
+        """Return the first numbers of the run as bytes of the struct."""
         size = self.ends.item(len(values) - 1) if len(values) else 0
         words = values.astype(">u8").view(np.uint8)
         return words[self._word_offsets[:size]].tobytes()
@@ -220,8 +210,7 @@ class WireForm(Protocol):
     A subclass defines `find_end`, `decode` and `encode`.
 
     Attributes:
-        is_text: whether fields of bytes contain printable characters. If so, they contain letters
-            in examples. The default is False.
+        is_text: whether fields of bytes contain printable characters; by default False.
     """
 
     is_text: ClassVar[bool] = False
@@ -229,8 +218,7 @@ class WireForm(Protocol):
     def begins(self, texts: Sequence[Characters]) -> Characters:
         """Return the first bytes of every encoded frame; None for a byte that varies.
 
-        The result ends before the first byte without a fixed offset. By default, it is empty: a
-        frame may begin at any byte, and `find_end` is called for each of them.
+        The result ends before the first byte without a fixed offset. By default, it is empty.
 
         Args:
             texts: the bytes of the first fields of the struct; None for each byte that varies.
@@ -248,10 +236,9 @@ class WireForm(Protocol):
         """Decode one frame, or its first bytes if the rest is missing; see `decode_runs`."""
 
     def encode(self, struct: bytes, runs: Sequence[Run]) -> bytes:
-        """Return the encoded frame for the bytes of a struct that consists of these runs.
+        """Return the encoded frame for the bytes of a struct.
 
-        For a value that cannot be encoded, the result may be any bytes, because the caller verifies
-        the frame by decoding it.
+        For a value that cannot be encoded, the result may be any bytes.
         """
 
     def largest(self, size: int) -> int:
@@ -268,11 +255,7 @@ _OWN_METHODS = ("find_end", "decode", "encode")
 
 
 def check_wire_form(form: object) -> None:
-    """Raise an error if an object lacks members of `WireForm`.
-
-    Raises:
-        SpecError: if it lacks one or more members.
-    """
+    """Raise SpecError if an object lacks members of `WireForm`."""
     kind = type(form)
     missing = [name for name in _MEMBERS if not hasattr(form, name)]
     missing += [
@@ -295,9 +278,6 @@ class BulkEnds(Protocol):
 
     def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
         """Return the size of the frame at each offset, or `NO_END` or `NO_FRAME`, (n,).
-
-        For a valid frame, the size is the same as that of `find_end`. For an invalid frame, the
-        result may be `NO_FRAME` instead.
 
         Args:
             buffer: the input.
@@ -324,10 +304,7 @@ class RunReader(Protocol):
 
     @property
     def position(self) -> int:
-        """The offset of the next field in the frame.
-
-        After the last field, it is the end of the frame.
-        """
+        """The offset of the next field in the frame, or the end of the frame."""
 
     def read(self, run: Run) -> tuple[bytes, Offsets]:
         """Read consecutive fields, up to the first invalid field.
@@ -387,11 +364,7 @@ def _make_digit_values(base: int) -> tuple[Values, NDArray[np.bool_]]:
 
 @lru_cache(maxsize=64)
 def _make_digit_weights(base: int) -> Values:
-    """Return the factor of a digit, by its position counted from the end of its token.
-
-    The last digit has the position 1. Position 0 is for characters that are not digits, and the
-    last position for digits beyond `MAX_DIGITS`. The factors of both positions are 0.
-    """
+    """Return the factor of a digit, by its position from the end of its token."""
     return np.array([0, *(base**place for place in range(MAX_DIGITS)), 0], np.uint64)
 
 
@@ -530,8 +503,7 @@ class Tokens:
     def _find_stop(self, data: bytes) -> tuple[int | None, Problem | None]:
         """Return the offset after the last token, and an error in the checksum.
 
-        The offset is None if the end of the frame is missing. The error is None if the checksum is
-        correct.
+        The offset is None if the end of the frame is missing.
         """
         if not data.endswith(self.end):
             return None, None
@@ -613,10 +585,9 @@ def _bits_of_float(value: float, size: int) -> int:
 
 
 def _write_decimal(value: np.floating[Any], form: str) -> bytes:
-    """Return a float as a decimal fraction.
+    """Return a float as a decimal fraction with at least the digits of `form`.
 
-    The text has all digits of the float, and at least the number of digits in `form`. It is empty
-    for nan, which means that the value is missing.
+    The text is empty for nan.
     """
     if not np.isfinite(value):
         return b""
@@ -630,7 +601,7 @@ def _write_decimal(value: np.floating[Any], form: str) -> bytes:
 
 
 class _TokenReader:
-    """Reads the tokens of one frame. The constructor converts all numbers.
+    """Reads the tokens of one frame.
 
     Args:
         data: the frame, up to the end of the last token.
@@ -751,10 +722,7 @@ class _TokenReader:
         return run.to_bytes(values[:count]), self._begins[first : first + count]
 
     def _read_decimal(self, token: int, size: int) -> int | None:
-        """Return a decimal fraction as the bits of a float.
-
-        Returns the bits of nan for an empty token, and None for an invalid token.
-        """
+        """Return a decimal fraction as the bits of a float; None for an invalid token."""
         text = self._data[self._begins[token] : self._marks[token]]
         if not text:
             return _bits_of_float(np.nan, size)
@@ -785,7 +753,7 @@ class Echoes:
 
     @cached_property
     def _step(self) -> re.Pattern[bytes]:
-        """The pattern of one step: an echo, and further echoes after marks."""
+        """The pattern of one step, which is a sequence of echoes."""
         mark = re.escape(self.mark)
         echo = b"[^%b].{%d}" % (mark, self.size - 1)
         return re.compile(b"%b(?:%b%b){0,%d}" % (echo, mark, echo, self.most - 1), re.DOTALL)
@@ -800,12 +768,11 @@ class Echoes:
             offsets: the offsets of the characters in the frame, (n,).
             end: the offset after the last character.
             zero: the character that is repeated for a missing echo.
-            is_whole: whether these are all characters of the frame.
+            is_whole: whether `characters` has all characters of the frame.
 
         Returns:
             The characters with all echoes, and the offset of each. A missing echo has the offset of
-            the next character. A mark that does not join two echoes is kept, and is later reported
-            as an invalid number.
+            the next character.
         """
         stride = self.size + len(self.mark)
         step_sizes = np.array([len(step) for step in self._find_steps(characters)], np.intp)
@@ -845,8 +812,6 @@ class Echoes:
 
     def join(self, characters: bytes, zero: bytes) -> bytes:
         """Return the characters of steps as they are sent, with marks between echoes.
-
-        Echoes of 0 at the end of a step are left out.
 
         Raises:
             SpecError: if `characters` does not consist of whole steps.
@@ -1115,7 +1080,7 @@ class Lines:
 
         Returns:
             The characters up to the first line with a wrong length, the offset of each character,
-            and the first error in the lines. The error is None if all lines are valid.
+            and the first error in the lines or None.
         """
         *lines, _ = data.split(b"\n")
         if lines and not lines[-1]:
@@ -1178,11 +1143,7 @@ class Escaped:
     """Frames between two flags, with escaped bytes (as in HDLC).
 
     A flag or an escape byte in the content is sent as an escape byte, followed by the byte with
-    some bits inverted. Two consecutive frames do not share a flag. Decoding accepts an escape
-    before any byte. Encoding escapes only flags and escape bytes.
-
-    Frames with a length, in which some bytes are doubled or inserted, require a `WireForm` of their
-    own.
+    some bits inverted. Two consecutive frames do not share a flag.
 
     Args:
         flag: the byte before and after a frame.
