@@ -1,7 +1,6 @@
 """File formats of scans, by the suffix of the file.
 
-`write` writes the points of scans to a file. The file has a temporary name until it is complete.
-`formats` returns all formats, including the formats of plugins. Modules in reading order:
+`write` writes the points of scans to a file. Modules in reading order:
 
 * `common`: functions shared by the formats.
 * `text`: .csv, .csv.gz and .xyz, one row per point.
@@ -90,8 +89,6 @@ def formats() -> dict[str, Format]:
 def format_of(path: str | Path) -> Format:
     """Return the format of a file name.
 
-    Plugins are loaded only if no built-in format has the suffix.
-
     Raises:
         UnknownFormat: if no format has the suffix.
     """
@@ -138,9 +135,9 @@ def write_imu(path: str | Path, samples: ImuSamples) -> None:
 
 
 def find_existing(path: str | Path) -> list[str]:
-    """Return the existing files that `write` may replace.
+    """Return the files that `write` may replace.
 
-    If the path has no placeholders, it is returned even if the file does not exist.
+    A path without placeholders is returned even if the file does not exist.
     """
     path = Path(path)
     if not PLACEHOLDER.search(str(path)):
@@ -171,14 +168,13 @@ def write(
         scans: the scans.
         every_point: whether to write points without a valid return as well.
         organized: whether to write every point of a scan in rows and columns, with nan for missing
-            points. A file then contains one scan, unless the format stores scans separately.
-        packets: raw packets to write to a ROS log in addition to the points; None for no packets.
+            points.
+        packets: raw packets to write to a ROS log in addition to the points.
 
     Raises:
         UnknownFormat: for an unknown suffix.
-        UsageError: if times repeat, so that a file would be overwritten; if `organized` is not
-            possible for the format, the sensor or the number of scans; or if the format cannot
-            store `packets`.
+        UsageError: if two files would have the same name; if `organized` is not possible for the
+            format, the sensor or the number of scans; or if the format cannot store `packets`.
         SourceError: if the file cannot be written.
     """
     path = Path(path)
@@ -210,8 +206,6 @@ def write(
 
 def require_feature(path: str | Path, feature: str) -> None:
     """Raise UsageError if the format of a path does not support a feature.
-
-    The error lists the formats that support the feature.
 
     Args:
         feature: a name in `Format.holds`.

@@ -1,9 +1,4 @@
-"""Write NumPy arrays (.npz, .npy) and Zarr folders.
-
-In an .npz file, the size of an array comes before its data, but it is known only at the end. Each
-column is therefore first written to an unnamed file in the same folder. In a Zarr folder, which
-xarray and Dask can open, the arrays grow by whole chunks.
-"""
+"""Write NumPy arrays (.npz, .npy) and Zarr folders."""
 
 from __future__ import annotations
 
@@ -44,9 +39,6 @@ def write_array(
     """Add a column to an archive as a NumPy array.
 
     Args:
-        archive: the archive.
-        name: the name of the array.
-        column: the values of the array.
         height: number of rows of an organized column; None for a flat column.
     """
     with archive.open(f"{name}.npy", "w", force_zip64=True) as target:
@@ -59,10 +51,8 @@ def write_array(
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False) -> None:
     """Write an .npz file with an array for each column, and arrays about the scans.
 
-    A column is written if all scans have it. The column `scan` has the number of each point's scan.
-    `stamp_ns`, `rate_hz` and `complete` have one value per scan. The unit of an additional column
-    NAME is in NAME.unit. With `organized`, the file has a single scan, and its arrays have the
-    shape (rows, columns), with several returns side by side.
+    A column is written if all scans have it. With `organized`, the file has a single scan, and its
+    arrays have the shape (rows, columns).
     """
     height: int | None = None
     with contextlib.ExitStack() as files:
@@ -109,9 +99,7 @@ def write_npy(
 ) -> None:
     """Write one structured array with PCL's layout, like `PointCloud.to_structured`.
 
-    Missing columns are 0. If there are several scans, the column `scan` has the number of each
-    point's scan. With `organized`, there is a single scan, and the array has the shape (rows,
-    columns). ``np.load(path, mmap_mode="r")`` maps the file into memory.
+    Missing columns are 0. With `organized`, the array has the shape (rows, columns).
     """
     write_rows(
         path,
@@ -127,7 +115,7 @@ def _make_structured_dtype(types: Mapping[str, Any]) -> np.dtype[Any]:
 
 
 def _make_npy_header(rows: PointRows) -> bytes:
-    """Return the header. NumPy pads it to a length that does not depend on the shape."""
+    """Return the header of a .npy file, with a length that is the same for all shapes."""
     header = io.BytesIO()
     shape = {
         "descr": np.lib.format.dtype_to_descr(rows.dtype),
@@ -139,10 +127,7 @@ def _make_npy_header(rows: PointRows) -> bytes:
 
 
 class _ZarrColumn:
-    """A Zarr array that grows by whole chunks.
-
-    No chunk is compressed twice.
-    """
+    """A Zarr array that grows by whole chunks."""
 
     def __init__(
         self, group: Any, name: str, dtype: DTypeLike, *, unit: str = "", along: str = "points"
@@ -160,10 +145,7 @@ class _ZarrColumn:
         self._length = 0
 
     def add(self, values: NDArray[Any] | None, length: int) -> None:
-        """Append values.
-
-        If `values` is None, nan is appended `length` times, or 0 for integers.
-        """
+        """Append values; if `values` is None, append `length` missing values."""
         dtype = self._array.dtype
         self._waiting.append(
             np.full(length, np.nan if dtype.kind == "f" else 0, dtype) if values is None else values
@@ -187,12 +169,8 @@ class _ZarrColumn:
 def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write a Zarr folder with the columns of the points, and arrays about the scans.
 
-    The columns are those of the first scan.
-
-    The dimension of point columns is "points"; the column `scan` has the number of each point's
-    scan. The dimension of `stamp_ns`, `rate_hz` and `complete` is "scans". Arrays have the
-    attribute `units`; the group has `sensor`, `source`, `frame` (the directions of x, y and z) and
-    `calibration`. If a later scan lacks a column, its values are nan, or 0 for integers.
+    The columns are those of the first scan. If a later scan lacks a column, its values are nan, or
+    0 for integers.
     """
     group = import_library("zarr", "zarr").open_group(str(path), mode="w")
     scan_columns = {

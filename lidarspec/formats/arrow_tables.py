@@ -1,7 +1,6 @@
 """Write tables with pyarrow, one row per point: Parquet, Arrow and Feather.
 
-Arrow and Feather files can be memory-mapped. A row group or record batch contains several scans,
-with at least `MIN_GROUP_ROWS` points. Columns are written without a copy.
+A row group or record batch has at least `MIN_GROUP_ROWS` points.
 """
 
 from __future__ import annotations
@@ -30,18 +29,9 @@ MAX_UNJOINED_BATCHES = 8
 def _write(
     path: Path, scans: Iterable[Scan], *, every_point: bool, open_writer: Callable[[Path, Any], Any]
 ) -> None:
-    """Write the points of scans as a table.
+    """Write the points of scans as a table with the columns of the first scan.
 
-    The table has the columns of the first scan, and columns about the scan of a point.
-
-    The column `scan` is the number of the scan. `stamp` is the stamp of the scan, as a timestamp in
-    ns without a time zone, which pandas and DuckDB read exactly. `time` is in seconds since this
-    stamp. `complete` is `Scan.complete`. If a later scan lacks a column, its values are nan, or
-    null for integers. With `every_point`, x, y and z of a point without a return are nan.
-
-    The metadata of a field has its unit. The metadata of the schema has `sensor`, `source` (the
-    document that describes the wire format), `frame` (the directions of x, y and z), `units` as
-    JSON, and `calibration`: "nominal" or "own".
+    If a later scan lacks a column, its values are nan, or null for integers.
     """
     tables = iter_tables(scans, path, every_point=every_point)
     first = next(tables)
@@ -55,10 +45,7 @@ def iter_tables(
 ) -> Iterator[Any]:
     """Yield the points of scans as tables of at least `MIN_GROUP_ROWS` rows.
 
-    At least one table is yielded, even if it is empty.
-
     Args:
-        scans: the scans.
         path: the path of the file. If a folder of the path has a name such as scan=7, the column
             `scan` is left out, as in Hive.
         every_point: whether to include points without a valid return.
@@ -91,10 +78,7 @@ def _make_table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
 
 
 def _make_scan_fields(path: Path | None) -> list[Any]:
-    """Return the schema fields with facts about scans.
-
-    If a folder of the path has a name such as scan=7, the field `scan` is left out.
-    """
+    """Return the schema fields with facts about scans, except those in the path."""
     arrow = import_library("pyarrow", "arrow")
     folders = path.parent.parts if path else ()
     named = {part.partition("=")[0] for part in folders if "=" in part}
@@ -132,11 +116,8 @@ def _make_batch(arrow: Any, schema: Any, cloud: PointCloud, number: int, scan: S
 
 
 def _make_array(arrow: Any, values: Any, kind: Any) -> Any:
-    """Return values as an Arrow array.
-
-    If the values have the required type, the array is made from their buffer, because pyarrow's own
-    conversion loads pandas, which takes 0.2 s.
-    """
+    """Return values as an Arrow array."""
+    # pyarrow's own conversion loads pandas, which takes 0.2 s.
     if not isinstance(values, np.ndarray) or arrow.from_numpy_dtype(values.dtype) != kind:
         return arrow.array(values, kind)
     if values.dtype == np.bool_:
@@ -147,11 +128,7 @@ def _make_array(arrow: Any, values: Any, kind: Any) -> Any:
 
 
 def open_parquet(path: Path, schema: Any) -> Any:
-    """Return a writer of a Parquet file without compression.
-
-    Compression would take longer than all other steps together. Columns of integers use a
-    dictionary, because they have few distinct values.
-    """
+    """Return a writer of a Parquet file without compression."""
     dictionary_columns = [
         field.name for field in schema if str(field.type) not in ("float", "double", "bool")
     ]
@@ -160,6 +137,7 @@ def open_parquet(path: Path, schema: Any) -> Any:
     return parquet.ParquetWriter(
         path,
         schema,
+        # Compression would take longer than all other steps together.
         compression="none",
         use_dictionary=dictionary_columns,
         write_statistics=statistics_columns,

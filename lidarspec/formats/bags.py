@@ -1,10 +1,8 @@
 """Write robotics logs: ROS messages in an MCAP file, ROS 1 bag or ROS 2 bag.
 
 The topic /points has each scan as sensor_msgs/PointCloud2. For planar sensors, /scan has each scan
-as sensor_msgs/LaserScan (see `messages`). The frame is "laser". The log time of both messages is
-the stamp of the scan. The units of additional columns are in the metadata of the log; ROS 1 bags
-have no metadata, so they do not contain the units. On request, /packets has the raw packets with
-their arrival times, so that the log can be read again as a source.
+as sensor_msgs/LaserScan. On request, /packets has the raw packets with their arrival times, so that
+the log can be read again as a source.
 """
 
 from __future__ import annotations
@@ -34,11 +32,9 @@ class BagWriter:
     """Makes the messages of one log.
 
     Args:
-        release: the ROS release of the message definitions, as rosbags names it, e.g.
-            "ROS1_NOETIC".
+        release: the ROS release of the message definitions, e.g. "ROS1_NOETIC".
 
     Attributes:
-        types: the message definitions.
         units: the units of the additional columns of the scans so far, by name.
     """
 
@@ -77,10 +73,7 @@ class BagWriter:
 def write_mcap(
     path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, every_point: bool
 ) -> None:
-    """Write an MCAP file with ROS 2 messages.
-
-    Foxglove, `ros2 bag` and PlotJuggler can read it.
-    """
+    """Write an MCAP file with ROS 2 messages."""
     mcap = import_library("mcap.writer", "ros")
     bag_writer = BagWriter("ROS2_HUMBLE")
     channels = dict[str, int]()
@@ -123,11 +116,8 @@ def write_ros2(
 
     Args:
         path: the folder or file.
-        scans: the scans.
-        packets: the raw packets.
         storage: "mcap" writes a folder with metadata.yaml and an MCAP file. "sqlite3" writes a
             single database file, which `ros2 bag` can also read.
-        every_point: whether to write points without a valid return.
     """
     import sqlite3  # only needed here
 

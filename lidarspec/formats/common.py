@@ -1,11 +1,7 @@
 """Functions shared by file formats.
 
-They select the points of scans, store columns in temporary files, and replace a file when the new
-file is complete.
-
-The writer of a format is a function that writes scans to a path while they arrive, so that it needs
-little memory. Many files begin with their size, which is known only at the end. The writer then
-fills in the size at the end, or it stores the columns in unnamed files until the size is known.
+The functions select the points of scans, store columns in temporary files, and replace a file when
+the new file is complete.
 """
 
 from __future__ import annotations
@@ -70,10 +66,7 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 
 def refuse_foreign_files(folder: Path) -> None:
-    """Raise UsageError if a folder contains files that are not from an export.
-
-    Replacing the folder would delete these files.
-    """
+    """Raise UsageError if a folder contains files that are not from an export."""
     if not folder.is_dir():
         return
     pattern = FOLDER_FILES.get(folder.suffix.lower())
@@ -90,8 +83,8 @@ def refuse_foreign_files(folder: Path) -> None:
 def write_in_thread(write: Callable[[_Piece], object]) -> Iterator[Callable[[_Piece], None]]:
     """Yield a function that writes a piece in a thread.
 
-    The caller can make the next piece meanwhile. All pieces are written when the block ends. An
-    error in the thread is raised by the next call, or at the end of the block.
+    All pieces are written when the block ends. An error in the thread is raised by the next call,
+    or at the end of the block.
     """
     with ThreadPoolExecutor(1) as thread:
         last: Future[object] = thread.submit(lambda: None)
@@ -106,7 +99,7 @@ def write_in_thread(write: Callable[[_Piece], object]) -> Iterator[Callable[[_Pi
 
 
 def select_points(scan: Scan, *, every_point: bool) -> PointCloud:
-    """Return the points of a scan to write: all points, or only the valid points."""
+    """Return all points of a scan, or only the valid points."""
     which = find_points(scan.points, every_point=every_point)
     if which is None:
         return scan.points
@@ -114,12 +107,10 @@ def select_points(scan: Scan, *, every_point: bool) -> PointCloud:
 
 
 def find_points(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | None:
-    """Return the indices of the points to write; None for all points.
-
-    Indexing a column by integers is several times as fast as indexing it by a mask.
-    """
+    """Return the indices of the points to write; None for all points."""
     if every_point or cloud.valid.all():
         return None
+    # Indexing a column by integers is several times as fast as indexing it by a mask.
     return np.flatnonzero(cloud.valid)
 
 
@@ -128,8 +119,7 @@ def select_columns(
 ) -> dict[str, NDArray[Any]]:
     """Return the columns of the points to write, by name.
 
-    Requested columns that the scan does not have are omitted. "valid" and additional columns can be
-    requested as well.
+    Requested columns that the scan does not have are omitted.
     """
     cloud = scan.points
     existing = tuple(name for name in names if name == "valid" or cloud.has_column(name))
@@ -149,7 +139,7 @@ def select_columns(
 def to_image(values: NDArray[Any], cloud: PointCloud) -> NDArray[Any]:
     """Return values of organized points, (n,), as an image, (rows, columns).
 
-    The image has one row for each ring. Several returns of a beam are side by side in the row.
+    The image has one row for each ring.
     """
     columns, rows = cloud.shape or (len(cloud), 1)
     returns = len(cloud) // max(columns * rows, 1) or 1

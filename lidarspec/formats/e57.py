@@ -1,4 +1,4 @@
-"""Write ASTM E57 with libE57Format (pye57): a header and points for each scan."""
+"""Write ASTM E57 files, with a header and points for each scan, with pye57."""
 
 from __future__ import annotations
 
@@ -53,16 +53,7 @@ REPLACED_TYPES = {
 
 
 def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write each scan with a header.
-
-    Points have coordinates, intensity, time, ring (as row), column, return, and the additional
-    columns. `timeStamp` is in seconds since acquisitionStart, which is the stamp of the scan as GPS
-    time with 18 leap seconds. `returnCount` of each point is the largest number of returns in the
-    scan. Additional columns have names of an extension, lidarspec:NAME, which other readers ignore;
-    the description of the scan has their units. With `every_point`, a point without a return has
-    the coordinates 0 and cartesianInvalidState 2. The library keeps the headers in memory until the
-    file is closed.
-    """
+    """Write each scan with a header."""
     pye57 = import_library("pye57", "e57")
     libe57 = import_library("pye57.libe57", "e57")
     with contextlib.ExitStack() as files:
@@ -124,7 +115,7 @@ def _convert_columns(own: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]
 
 
 def _make_header(number: int, scan: Scan) -> dict[str, Any]:
-    """Return the header of a scan: values by name."""
+    """Return the header of a scan as values by name."""
     units = ", ".join(f"{name} [{unit}]" for name, unit in scan.points.units.items() if unit)
     start = (scan.stamp_ns - GPS_EPOCH_NS) * 1e-9
     return {
@@ -142,13 +133,7 @@ def _make_header(number: int, scan: Scan) -> dict[str, Any]:
 
 
 def _find_limits(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return the minimum and the maximum of the columns, for the header of a scan.
-
-    Points without a valid return are ignored.
-
-    Returns:
-        The minima and maxima by name, for each group of limits in E57.
-    """
+    """Return the minimum and the maximum of the columns, for the header of a scan."""
     valid = columns["cartesianInvalidState"] == 0
     if not valid.any():
         return {}
@@ -176,10 +161,7 @@ def _make_node(libe57: Any, image: Any, value: Any) -> Any:
 
 
 def _make_column_node(libe57: Any, image: Any, column: NDArray[Any]) -> Any:
-    """Return the node of a column.
-
-    Integers use the number of bits that their range requires.
-    """
+    """Return the node of a column."""
     if column.dtype.kind != "f":
         low, high = (int(column.min()), int(column.max())) if len(column) else (0, 0)
         return libe57.IntegerNode(image, low, low, high)

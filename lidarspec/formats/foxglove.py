@@ -1,8 +1,7 @@
 """Write logs for Foxglove: scans as Foxglove Protobuf messages in an MCAP file.
 
 The topic /points has each scan as foxglove.PointCloud. For planar sensors, /scan has each scan as
-foxglove.LaserScan. The stamps, the frame, the layout of the points, and the units in the metadata
-are the same as in ROS logs (see `bags`).
+foxglove.LaserScan.
 """
 
 from __future__ import annotations

@@ -1,14 +1,11 @@
 """Write frames of any type, one row per frame, with their fields in units.
 
-A row has the time of the frame, `time_ns`, and each field that is not constant. Numbers are in the
-unit of the field; integers without a unit are unchanged. Bytes are hexadecimal text, or plain text
-if the frame is text. Each element of an array of numbers is a column, for example `gains[2]`. Its
-value is nan if a frame does not have the element.
+A row has the time of the frame, `time_ns`, and each field that is not constant. Each element of an
+array of numbers is a column, for example `gains[2]`.
 
 Parts of a frame have rows of their own. Their type is, for example, "report.tags.temperature".
 
-A table contains one frame type. An MCAP file has a topic for each type, with JSON messages for
-Foxglove and PlotJuggler. The log time of a message is the arrival time of the frame if it is known.
+A table contains one frame type. An MCAP file has a topic for each type, with JSON messages.
 """
 
 from __future__ import annotations
@@ -57,9 +54,9 @@ def frame_columns(packets: Packets) -> Columns:
 
 
 def _read_numbers(packets: Packets, path: str, info: FieldInfo) -> NDArray[Any]:
-    """Return a field in its unit, (n, ...) float64.
+    """Return a field in its unit, (n, ...).
 
-    If the field is an integer without a unit, and all frames have it, the integers are returned.
+    Integers without a unit remain integers if all frames have the field.
     """
     values = packets[path]
     if info.kind == "int" and not info.scaled and values.ndim == 1 and not np.isnan(values).any():
@@ -79,11 +76,7 @@ def _split_elements(path: str, values: NDArray[Any]) -> Columns:
 
 
 def _format_bytes(values: NDArray[Any], *, is_text: bool) -> list[str]:
-    """Return the bytes of a field, (n, ..., bytes), as one text per frame.
-
-    Args:
-        is_text: whether to decode the bytes as ASCII, instead of writing hexadecimal digits.
-    """
+    """Return the bytes of a field, (n, ..., bytes), as one text per frame."""
     rows = [row.tobytes() for row in values]
     if is_text:
         return [row.rstrip(b"\x00").decode("ascii", "backslashreplace") for row in rows]
@@ -184,11 +177,7 @@ def _write_table(
 
 
 def _with_float_integers(columns: Columns) -> Columns:
-    """Return columns with integers converted to float64, except `time_ns`.
-
-    If a frame of a batch lacks a field, the column of this batch is float64. The conversion makes
-    the types of all batches equal.
-    """
+    """Return columns with integers converted to float64, except `time_ns`."""
     return {
         name: values.astype(np.float64)
         if name != "time_ns" and not isinstance(values, list)

@@ -44,21 +44,8 @@ WITHHELD_FLAG = 1 << 2
 def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compressed: bool) -> None:
     """Write a LAS or LAZ file.
 
-    A point has coordinates, an intensity, a return number, a GPS time and extra dimensions. The
-    ring, the column, the number of the scan and the additional columns are extra dimensions. The
-    description of an additional column is its unit. "_" is appended to a name that LAS already
-    uses. If a later scan lacks a column, its values are nan, or 0 for integers.
-
-    `intensity` is the raw value, rounded and limited to 65535. The stamp is interpreted as a time
-    since 1970. It is written as adjusted standard GPS time with 18 leap seconds, exact to 0.1
-    microseconds. `number_of_returns` of each point is the largest number of returns in the scan.
-    With `every_point`, a point without a return has the flag "withheld", and its coordinates are
-    the offsets in the header, because LAS has no nan. Range and angles are omitted, because they
-    follow from the coordinates.
-
     Raises:
-        UsageError: if a coordinate is more than 214 km from the offset in the header. Larger
-            distances do not fit into 32 bits.
+        UsageError: if a coordinate is more than 214 km from the offset in the header.
     """
     laspy = import_library("laspy", "las")
     with contextlib.ExitStack() as files:
@@ -131,11 +118,7 @@ def _fill_header(
 
 
 def _choose_offset(coordinates: NDArray[Any]) -> float:
-    """Return the offset of the coordinates along one axis, in metres.
-
-    It is the first finite coordinate, rounded to whole metres, if this is farther than
-    `MAX_UNSHIFTED_M` from 0; else 0.
-    """
+    """Return the offset of the coordinates along one axis, in metres."""
     first = coordinates[np.isfinite(coordinates)][:1].round()
     if len(first) and abs(first[0]) > MAX_UNSHIFTED_M:
         return float(first[0])
@@ -164,8 +147,6 @@ def _fill_records(
     """Fill LAS records with points.
 
     Args:
-        rows: the records.
-        part: the columns of the points.
         extra_names: the name of the extra dimension of each column.
         offsets: the offsets of x, y and z, in metres.
     """
@@ -190,10 +171,7 @@ def _fill_records(
 
 
 def _write_compressed(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write a LAZ file, which is a compressed LAS file.
-
-    The LAZ file has 1/6 to 1/2 of the size of the LAS file. Writing takes seven times as long.
-    """
+    """Write a LAZ file, which is a compressed LAS file."""
     lazrs = import_library("lazrs", "las")
     try:
         _write(path, scans, every_point=every_point, is_compressed=True)

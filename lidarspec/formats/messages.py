@@ -1,9 +1,7 @@
 """Serialize scans, packets and IMU samples as ROS messages, for logs and topics.
 
 A scan becomes a sensor_msgs/PointCloud2. For planar sensors, it also becomes a
-sensor_msgs/LaserScan with evenly spaced angles. Points have PCL's layout: x y z intensity time as
-float32, ring as uint16, then the additional columns. Columns that the sensor does not have are
-omitted.
+sensor_msgs/LaserScan with evenly spaced angles.
 """
 
 from __future__ import annotations
@@ -49,11 +47,7 @@ class RosMessages:
     The methods raise UsageError if the stamp is outside the range of ROS messages.
 
     Args:
-        release: the ROS release of the message definitions, as rosbags names it, e.g.
-            "ROS1_NOETIC".
-
-    Attributes:
-        types: the message definitions.
+        release: the ROS release of the message definitions, e.g. "ROS1_NOETIC".
     """
 
     def __init__(self, release: str) -> None:
@@ -69,7 +63,6 @@ class RosMessages:
         """Return a raw packet as a message that `transports.robotics_logs` can read.
 
         Args:
-            packet: the packet.
             datagram: whether the packet is a datagram, not a piece of a stream.
         """
         at = packet.at or 0
@@ -86,11 +79,9 @@ class RosMessages:
     def cloud(self, scan: Scan, at: int, *, every_point: bool, number: int = 0) -> RosMessage:
         """Return a PointCloud2 message with the points of a scan.
 
-        If all points of an organized scan are written, the cloud has a row for each ring, with
-        several returns side by side. Otherwise it has a single row.
+        If all points of an organized scan are written, the cloud has a row for each ring.
 
         Args:
-            scan: the scan.
             at: the stamp of the message, ns.
             every_point: whether to include points without a valid return.
             number: the number of the scan, for the header of ROS 1 messages.
@@ -132,11 +123,7 @@ class RosMessages:
         )
 
     def imu(self, samples: ImuSamples, index: int, at: int, frame_id: str) -> RosMessage:
-        """Return an Imu message with one sample, as REP-145 specifies.
-
-        The first covariance of a quantity is -1 if the sensor does not measure the quantity. It is
-        0 if the measurement error is unknown.
-        """
+        """Return an Imu message with one sample, as REP-145 specifies."""
         vector = self.types.types["geometry_msgs/msg/Vector3"]
         values: dict[str, Any] = {}
         for name in ("angular_velocity", "linear_acceleration"):
@@ -178,8 +165,6 @@ def describe_fields(cloud: PointCloud, points: NDArray[Any]) -> list[tuple[str, 
     """Return (name, offset, type) of each field of a cloud's records.
 
     The offset is in bytes. The type is, for example, "f4".
-
-    Columns that the cloud does not have are omitted.
     """
     lacking = {
         name

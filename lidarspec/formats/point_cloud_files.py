@@ -1,8 +1,6 @@
 """Write point clouds: PCD of the Point Cloud Library, PLY, and the .bin of KITTI.
 
-In these formats, a file is one cloud. If several scans are written, their points follow one
-another, and the field `scan` has the number of the scan. `time` is in seconds since the stamp of
-the scan. Comments in the header give the stamp of the first scan, the sensor and the units.
+If several scans are written, the field `scan` has the number of the scan.
 """
 
 from __future__ import annotations
@@ -40,9 +38,8 @@ def write_pcd(
 ) -> None:
     """Write a binary PCD 0.7 file.
 
-    The fields are x y z, intensity, ring and time if the sensor has them, and the additional
-    columns. If every point of a single organized scan is written, WIDTH and HEIGHT are the shape of
-    the scan, and missing points are nan. Otherwise HEIGHT is 1.
+    If every point of a single organized scan is written, WIDTH and HEIGHT are the shape of the
+    scan.
     """
     write_rows(path, _make_pcd_rows(scans, every_point=every_point), _make_pcd_header)
 
@@ -127,9 +124,7 @@ def _make_pcd_header(rows: PointRows, data: str = "binary") -> bytes:
 def write_ply(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write a binary little-endian PLY file.
 
-    The properties are x y z, intensity, ring and time if the sensor has them, and the additional
-    columns. Their types are float, double, uchar or int, because Open3D ignores other types. `ring`
-    is an int. Integers that do not fit into an int become double.
+    The types are float, double, uchar or int, because Open3D ignores other types.
     """
     write_rows(
         path,
@@ -165,8 +160,7 @@ def _packed_dtype(types: Mapping[str, Any], supported: Mapping[str, str]) -> np.
 def write_kitti(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write x y z intensity as little-endian float32, without a header.
 
-    The intensity is the raw value; it is not scaled to 0..1 as in KITTI. It is 0 if the sensor
-    measures no intensity. KITTI stores each scan in a file: write to ``out/%06d.bin``.
+    The intensity is the raw value, or 0 if the sensor measures no intensity.
     """
     row = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
     write_rows(path, PointRows(scans, lambda types: row, every_point=every_point), lambda rows: b"")

@@ -1,7 +1,4 @@
-"""Convert points to rows of bytes, for PCD, PLY, KITTI's .bin and .npy.
-
-A file has a header with the number of rows, and then the rows of all scans.
-"""
+"""Convert points to rows of bytes, for PCD, PLY, KITTI's .bin and .npy."""
 
 from __future__ import annotations
 
@@ -31,12 +28,9 @@ WRITE_BYTES = 1 << 20
 class PointRows:
     """Yields the points of each scan as rows of a structured array, (n,).
 
-    The possible columns are x y z intensity ring time, the additional columns of the first scan,
-    and, for several scans, the number of the scan (`scan`). If a later scan lacks a column, its
-    values are 0.
+    If a scan lacks a column of the first scan, its values are 0.
 
     Args:
-        scans: the scans.
         layout: a function that returns the type of a row, given the types of the first scan's
             columns by name.
         every_point: whether to include points without a valid return.
@@ -46,8 +40,7 @@ class PointRows:
     Attributes:
         dtype: the type of a row.
         length: number of rows so far.
-        shape: (width, height) of the image if the points are ordered row by row, else None. Several
-            returns are side by side in a row.
+        shape: (width, height) of the image if the points are ordered row by row, else None.
         facts: lines for a header: the sensor, the stamp of the first scan, and the units.
     """
 
@@ -104,10 +97,7 @@ class PointRows:
     def _select_columns(
         self, scan: Scan, number: int, names: Sequence[str]
     ) -> dict[str, NDArray[Any]]:
-        """Return the columns of the points to write, by name.
-
-        Requested columns that the scan does not have are omitted. "scan" is the number of the scan.
-        """
+        """Return the requested columns of the points to write, if the scan has them."""
         columns = select_columns(scan, names, every_point=self._every_point)
         if "scan" in names:
             columns["scan"] = np.full(len(columns["x"]), number, np.int32)
@@ -118,10 +108,8 @@ def write_rows(path: Path, rows: PointRows, header: Callable[[PointRows], bytes]
     """Write a header and rows.
 
     Args:
-        path: the file.
-        rows: the rows.
-        header: a function that returns the header. It is called before the rows, and again when the
-            number of rows is known, so the length of the header must not depend on this number.
+        header: a function that returns the header. It is called twice, and the length of the header
+            must not depend on the number of rows.
     """
     with path.open("wb") as file:
         file.write(header(rows))

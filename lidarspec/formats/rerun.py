@@ -1,9 +1,7 @@
 """Write Rerun recordings, .rrd: scans as coloured points, with statistics.
 
-The data is logged on a timeline of the sensor's clock and on a timeline of the host's clock. `view
---rerun` also uses `RerunRecording`, to send data to the Rerun viewer. The entity paths of a sensor
-(points, mount, facts, `statistics`) begin with its id, so that recordings of several sensors can be
-opened together.
+The data is on two timelines: the sensor's clock and the host's clock. The entity paths of a sensor
+begin with its id, so that recordings of several sensors can be opened together.
 """
 
 from __future__ import annotations
@@ -200,10 +198,7 @@ class RerunRecording:
             self.stream.set_time(HOST_TIMELINE, timestamp=np.datetime64(scan.host_ns, "ns"))
 
     def _make_layout(self) -> Any:
-        """Return the layout of the viewer: points, statistics and facts.
-
-        The timeline of the sensor's clock is selected.
-        """
+        """Return the layout of the viewer: points, statistics and facts."""
         views = import_library("rerun.blueprint", "rerun")
         plots = [
             views.TimeSeriesView(
@@ -230,8 +225,7 @@ class _PipeCopy(threading.Thread):
 
     Attributes:
         end: the file descriptor to which the SDK writes.
-        failure: the error that ended the writing of the file, or None. After an error, the output
-            of the SDK is discarded.
+        failure: the error that ended the writing of the file, or None.
 
     Raises:
         OSError: if the file cannot be opened.
@@ -266,16 +260,13 @@ def _translate_errors() -> Iterator[None]:
 
 
 class _Colours:
-    """Returns the colours of points.
-
-    The first cloud determines the scale of the colours.
-    """
+    """Returns the colours of points, on the scale of the first cloud."""
 
     def __init__(self) -> None:
         self._look: CloudAppearance | None = None
 
     def __call__(self, cloud: PointCloud, ramp: str) -> NDArray[np.uint8]:
-        """Return the colours of points, (n, 3): red, green and blue."""
+        """Return the red, green and blue of points, (n, 3)."""
         shown = self._look or choose_appearance(cloud, ramp=ramp)
         if len(cloud):  # an empty cloud has no scale
             self._look = shown

@@ -1,7 +1,4 @@
-"""Write text files with one row per point: .csv, .csv.gz and .xyz.
-
-Memory use does not depend on the number of points.
-"""
+"""Write text files with one row per point: .csv, .csv.gz and .xyz."""
 
 from __future__ import annotations
 
@@ -34,24 +31,18 @@ _GZIP_LEVEL = 1
 
 @contextlib.contextmanager
 def open_text_file(path: Path, *, is_zipped: bool = False) -> Iterator[Callable[[str], None]]:
-    """Open a text file, and yield a function that writes to it.
-
-    The function writes in a thread, while the caller makes the next text. A compressed file
-    contains neither its name nor a time, so that equal content gives equal files.
-    """
+    """Open a text file, and yield a function that writes to it in a thread."""
     with contextlib.ExitStack() as files:
         file: Any = files.enter_context(path.open("wb"))
         if is_zipped:
+            # Without a name and a time, equal content gives equal files.
             file = files.enter_context(gzip.GzipFile("", "wb", _GZIP_LEVEL, file, mtime=0))
         text = files.enter_context(io.TextIOWrapper(file, encoding="ascii", newline=""))
         yield files.enter_context(write_in_thread(text.write))
 
 
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_zipped: bool = False) -> None:
-    """Write a .csv file.
-
-    It has the columns of the first scan, and a column `scan` with the number of the scan.
-    """
+    """Write a .csv file with the columns of the first scan, and a column `scan`."""
     names: tuple[str, ...] = ()
     with open_text_file(path, is_zipped=is_zipped) as put:
         for number, scan in enumerate(scans):
@@ -98,7 +89,6 @@ def _put_rows(put: Callable[[str], None], template: str, columns: Sequence[NDArr
     Args:
         put: a function that writes a text to the file.
         template: the %-format of a row.
-        columns: the columns, (n,) each.
     """
     for start in range(0, len(columns[0]), BLOCK_ROWS):
         rows = zip(
