@@ -1,19 +1,12 @@
 """Columns: the operands of `points`, `plausible` and clock functions.
 
-A `Batch` is a table of packets, with the breaks in the stream, the last frame of each other type
-before each packet, and values from the previous batch. The argument of a function is ``f``, the
-`Fields` of a batch. Each attribute of ``f`` is a `Column`.
+The argument of a function is ``f``, the `Fields` of a `Batch` of packets. Each attribute of ``f``
+is a `Column`, which is an array with one axis for the packets and one axis for each level of arrays
+in the struct.
 
-A `Column` is an array with one axis for the packets and one axis for each level of arrays in the
-struct. If the field is outside of an array, the axis of this array has length 1. Each axis has the
-name of its array. Therefore, arithmetic aligns columns by name, and fields of different arrays
-cannot be mixed by accident. If values depend on later packets, ``ready`` is the number of packets
-whose values are final. `FlatColumn` has the values of a column in stream order, without padding;
-`previous`, `following` and `last` use it.
-
-`align` accepts columns and arrays. An array made by `along` is aligned by the name of its array. A
-plain array is aligned by its length, if exactly one array of the frame has this length. If a plain
-array has as many axes as there are nested arrays, it is aligned by position, as in NumPy.
+Each axis has the name of its array. Therefore, arithmetic aligns columns by name, and fields of
+different arrays cannot be mixed by accident. A plain array has no names. It is aligned by its
+length, if exactly one array of the frame has this length.
 """
 
 from __future__ import annotations
@@ -141,7 +134,7 @@ class Column(NDArrayOperatorsMixin):
 
     @property
     def seen(self) -> NDArray[Any]:
-        """All values. In a traced column, this property has only the sample values."""
+        """All values; in a traced column, only the sample values."""
         return self.array
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -179,10 +172,7 @@ class Column(NDArrayOperatorsMixin):
         return function(*plain, **kwargs)
 
     def apply_function(self, function: Callable[..., Any], *values: Any) -> Column:
-        """Apply a function to the values, after aligning the values by their axes.
-
-        Plain arrays align by their last axes, as in NumPy.
-        """
+        """Apply a function to the values, after aligning the values by their axes."""
         arrays, axes, ready = align(values, self.batch)
         try:
             array = call_aligned(function, arrays)
@@ -252,7 +242,7 @@ class Column(NDArrayOperatorsMixin):
         )
 
     def steps(self) -> AlongAxis | NDArray[np.intp]:
-        """Return the numbers from 0 to m - 1, (m,). m is the largest value of the column.
+        """Return the numbers below the largest value of the column: 0, 1, 2 ...
 
         If the column is the length of an array, the numbers are the indices of this array.
         """
@@ -274,10 +264,9 @@ class Column(NDArrayOperatorsMixin):
         return AlongAxis((axis,), np.arange(_find_extent(self.batch.table, axis, most)))
 
     def gather(self, table: NDArray[np.float64]) -> Column:
-        """Return a row of a table for each value. The value is the index of the row.
+        """Return the row of a table for each value, which is the index of the row.
 
-        The k numbers of a row become the elements along an array of the frame, which has k
-        elements.
+        The k numbers of a row become the elements along an array of the frame with k elements.
 
         Args:
             table: (m + 1, k). The last row is nan; values outside of 0 to m - 1 select this row.
@@ -346,7 +335,7 @@ class Column(NDArrayOperatorsMixin):
     def latest(self, where: Any = None) -> Column:
         """Return for each element the latest value so far for which `where` is true.
 
-        The value of the element itself is included. The result is nan before the first such value.
+        The result is nan before the first such value.
 
         Args:
             where: a condition that aligns with the column; by default, whether the value is finite.
@@ -494,16 +483,13 @@ def align(
         else:
             arrays.append(_reshape_to_axes(np.asarray(value), axes, lengths, batch.table))
     if not len(batch):
+        # A column of variable length is empty, but a table of the plugin is not.
         arrays = _cut_to_shortest(arrays)
     return arrays, tuple(axes), min((column.ready for column in columns), default=len(batch))
 
 
 def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
-    """Cut the arrays to the shortest length along each axis, so that they broadcast.
-
-    Axes of length 1 are not changed. The lengths differ if there are no packets: a column of
-    variable length is then empty, but a table of the plugin is not.
-    """
+    """Cut the arrays to the shortest length along each axis, except length 1."""
     reversed_shapes = [array.shape[::-1] for array in arrays]
     shortest = [
         min((length for length in lengths if length != 1), default=1)
@@ -516,11 +502,7 @@ def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
 
 
 def _merge_axis_names(first: str | None, name: str | None) -> str | None:
-    """Return the common name of an axis of two values.
-
-    Args:
-        first: the name of the axis in the first value; None without a name.
-        name: the name of the axis in the second value; None without a name.
+    """Return the common name of an axis of two values; None is no name.
 
     Raises:
         SpecError: if two names that were not guessed belong to different arrays.
@@ -554,10 +536,8 @@ def _reshape_to_axes(
     """Reshape a plain array to the given axes, and name axes that have no name.
 
     Args:
-        array: the plain array.
         axes: the names of the axes, which are changed in place.
         lengths: the lengths of the axes.
-        table: the table of the packets.
 
     Raises:
         SpecError: if the length of the array fits several arrays of the frame, or none.
@@ -590,14 +570,10 @@ def _find_axis(
 ) -> int:
     """Return the index in `axes` at which the axes of a plain array begin.
 
-    The index is found by the lengths of the plain array. They are first compared with the columns
-    that are combined with the array, and then with the arrays of the frame.
-
     Args:
         shape: the lengths of the plain array.
         axes: the names of the axes of the columns.
         lengths: the lengths of the axes of the columns.
-        table: the table of the packets.
         without: indices in `axes`. Arrays of the frame at these indices are ignored.
     """
     wanted = [(place, length) for place, length in enumerate(shape) if length != 1]
@@ -685,14 +661,12 @@ def align_points(
 
 
 def _find_extent(table: Table, axis: str, length: int) -> int:
-    """Return the length to use for values along an array.
-
-    If an outer array is empty in some frame, `length` is limited to the maximum length of the
-    array. Otherwise `length` is returned.
+    """Return the length to use for values along an array of the frame.
 
     Args:
         axis: the path of the array.
     """
+    # An array in an outer array without elements has no length of its own.
     if any((table.counts(other) == 0).any() for other in table.schema.outer(axis)):
         return min(length, table.length(axis))
     return length
@@ -703,7 +677,7 @@ def _pad_to_extent(array: NDArray[Any], place: int, table: Table, axis: str) -> 
 
     Args:
         place: the index of the axis to change.
-        axis: the name of the array.
+        axis: the name of the array of the frame.
     """
     length = array.shape[place]
     missing = table.length(axis) - length
@@ -762,11 +736,7 @@ def call_aligned(function: Callable[..., Any], arrays: Sequence[Any]) -> NDArray
 
 
 def remainder(values: Any, full: Any) -> NDArray[Any]:
-    """Return exactly the same values as ``np.remainder``.
-
-    This function is four times as fast for values from -full to 2 * full, such as nearly all
-    angles.
-    """
+    """Return the same values as ``np.remainder``, faster for nearly all angles."""
     if np.ndim(full) or not full > 0 or np.ndim(values) == 0 or values.dtype != np.float64:
         return np.asarray(np.remainder(values, full))
     turns = np.subtract(values < 0, values >= full, dtype=np.int8)
@@ -783,7 +753,6 @@ def _take_connected_tail(
     """Return the last values before index `end`, beginning after the last loss.
 
     Args:
-        values: the values in stream order.
         edges: the indices of the first values after losses.
         size: the maximum number of values to return.
     """
@@ -843,7 +812,7 @@ def _name_axis(name: str, length: int, table: Table, *, known: bool) -> str | No
     """Return `name`; None if the array has exactly one element in every packet.
 
     Args:
-        known: whether the lengths of the array in `table` are those in the packets.
+        known: whether `table` has the lengths of the array in the packets.
     """
     if length != 1 or (
         known
@@ -934,7 +903,7 @@ def _list_paths(batch: Batch, frame: str) -> Iterable[str]:
     """Return the paths of the fields of one frame type.
 
     Args:
-        frame: the name of a frame type in `batch.state`; "" for the type of the packets.
+        frame: the name of the frame type; "" for the type of the packets.
     """
     if not frame:
         return batch.table.schema.columns
@@ -943,10 +912,7 @@ def _list_paths(batch: Batch, frame: str) -> Iterable[str]:
 
 
 class _States:
-    """``f.state``: the fields of other frame types.
-
-    For each packet, a field has its value in the last frame of its type before the packet.
-    """
+    """``f.state``: for each packet, the last frames of other types."""
 
     def __init__(self, batch: Batch) -> None:
         self._batch = batch
@@ -960,11 +926,7 @@ class _States:
 
 
 def _read_column(batch: Batch, frame: str, path: str) -> Column:
-    """Return a field of a batch as a column.
-
-    A field of another frame type has, for each packet, the value in the last frame of this type
-    before the packet, or the declared default.
-    """
+    """Return a field of a batch as a column."""
     depth = batch.table.schema.depth()
     table, which = batch.state[frame] if frame else (batch.table, np.zeros(0, np.intp))
     if (

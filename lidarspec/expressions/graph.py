@@ -1,20 +1,12 @@
 """Trace a function of fields: record its steps as a graph by calling it once.
 
-`trace` calls a `points`, `plausible` or clock function with `TracedFields`, and returns its result
-and the `Trace` of its steps. A step is a `Node`: a field, a state column, an elementwise call, or a
-step that depends on the order of packets (`on`, `shift`, `latest`). Every node has its result for
-two sample packets, which defines its shape and axes. Some steps cannot be recorded: a branch that
-depends on data, a reduction, or an attribute of an array. They raise `UntraceableError` with the
-reason.
+`trace` calls a `points`, `plausible` or clock function, and returns its result and the `Trace` of
+its steps. A step is a `Node`: a field, a state column, an elementwise call, or a step that depends
+on the order of packets. Some steps cannot be recorded, for example a branch that depends on data.
+They raise `UntraceableError`.
 
 `traverse` iterates over the nodes of a graph, and `compute` evaluates it for given values of the
 fields. The compilers of points (`points.numpy_plan`, `points.numba_kernels`) translate a graph.
-They split conditions and sums by functions of this module. In these functions, an expression is
-*full* if each point has its own value. Otherwise, it is *low*, and the reference evaluator computes
-it once for each packet or block.
-
-Operands that are not nodes (`vocabulary.AlongAxis`, plain arrays) are aligned when they are
-recorded, so that evaluating the graph only broadcasts arrays.
 """
 
 from __future__ import annotations
@@ -107,11 +99,7 @@ class Node:
 
     @cached_property
     def _operands(self) -> list[tuple[bool, Any]]:
-        """A pair for each argument.
-
-        For a node, the pair is True and a tuple of 1s, one for each axis that the node lacks. For a
-        constant, the pair is False and the constant as an array.
-        """
+        """For each argument, whether it is a node, and the axes to add or the constant."""
         depth = max(len(arg.sample.axes) for arg in self.args if isinstance(arg, Node))
         return [
             (
@@ -123,10 +111,7 @@ class Node:
         ]
 
     def value(self, args: list[Any]) -> Any:
-        """Return the value, computed from the arguments.
-
-        The value is a column if the arguments are columns, otherwise an array.
-        """
+        """Return the value of the node, given the values of its arguments."""
         if self.kind != "call":
             return self.function(*args)
         first = args[self._first]
@@ -164,8 +149,8 @@ class Trace:
         """Add a node, and return it as a traced column.
 
         Args:
-            path: the path of the field, if the node reads a field. If the trace already has a node
-                for this path, that node is returned.
+            path: the path of the field, if the node reads a field. An existing node for this path
+                is returned.
         """
         if path in self._read:
             return TracedColumn(self._read[path], self)
@@ -234,12 +219,10 @@ class TracedColumn(NDArrayOperatorsMixin):
         return self.node.sample.index
 
     def on(self, *axes: str) -> Any:
-        """Record `Column.on`.
-
-        Returns nan if the sample packets have no elements of the column's array.
-        """
+        """Record `Column.on`."""
         sample = self.node.sample.on(*axes)
         if sample.array.size > self.node.sample.array.size:
+            # The sample packets have no elements of the column's array.
             if not self.node.sample.array.size:
                 return np.nan
             raise UntraceableError(".on() cannot move values to a longer array")
@@ -372,14 +355,8 @@ def _fold_table_rows(
 ) -> tuple[Node, NDArray[np.float64]] | None:
     """Apply a function to whole tables, before their rows are looked up.
 
-    This is possible if each operand is a number, a row that all packets share, or rows of a table,
-    and if all tables have the same indices. The advantage is that sines and cosines of directions
-    in a table are computed only once.
-
     Args:
-        function: the elementwise function.
-        values: the operands.
-        arrays: the operands after alignment.
+        arrays: the values after alignment.
 
     Returns:
         The node of the indices, and the new table. None if this is not possible.
@@ -427,10 +404,7 @@ def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Trace]:
 
 
 def make_sample(batch: Batch, group: LayoutRows) -> Batch:
-    """Return a batch for tracing, which has the first frame of a group twice.
-
-    With two packets, values that all packets share can be distinguished from values of each packet.
-    """
+    """Return a batch for tracing, which has the first frame of a group twice."""
     return batch.of(
         LayoutRows(group.layout, group.where[[0, 0]], np.ascontiguousarray(group.rows[[0, 0]]))
     )
@@ -459,10 +433,8 @@ def compute(
     """Compute the value of a node and of the nodes that it depends on.
 
     Args:
-        results: the known values of nodes, as columns or as arrays with one row for each packet.
-            New values are added, so that each node is computed once.
-        source: a function that returns the value of a node, such as a field. If the function
-            returns None, the node is computed from its arguments.
+        results: the known values of nodes, to which new values are added.
+        source: a function that returns the value of a node, such as a field, or None to compute it.
 
     Returns:
         A column if the values of the fields are columns, otherwise an array.
@@ -554,8 +526,7 @@ IntegerConverter = Callable[[Any, int], NDArray[np.int64]]
 class HeaderFunction:
     """Evaluates a function of header fields, and caches the terms of its result.
 
-    For example, the date in a clock is the same in thousands of packets, and many operations are
-    needed to compute it. A term is therefore computed again only if its fields have changed.
+    A term is computed again only if its fields have changed.
 
     Args:
         function: a function of `Fields` that returns a column, or several columns (the terms).
@@ -655,7 +626,7 @@ class _ResultPart:
 def header_function(
     function: Callable[[Any], Any], schema: Schema, to_integers: IntegerConverter
 ) -> HeaderFunction:
-    """Return the `HeaderFunction` of a function and a schema. The result is cached."""
+    """Return the `HeaderFunction` of a function and a schema, cached."""
     return HeaderFunction(function, to_integers)
 
 
@@ -683,8 +654,7 @@ class Term:
     Attributes:
         row: the factor, a number or a row of numbers that all packets share.
         low: the node, if it has one value for each packet or block.
-        full: the node, if each point has its own value. If both nodes are None, the term is the
-            factor alone.
+        full: the node, if each point has its own value.
     """
 
     row: NDArray[np.float64]
@@ -702,10 +672,10 @@ def is_full(value: Any, width: int) -> bool:
 
 
 def find_choice(node: Node, width: int) -> tuple[Node, Any, Any] | None:
-    """Return the condition and the two options of a simple ``np.where``.
+    """Return the condition and the two options of a simple ``np.where``, or None.
 
     The condition has one value for each packet or block. Each option is a number, or an expression
-    of one field with a value for each point. Returns None for all other nodes.
+    of one field with a value for each point.
     """
     if node.kind != "call" or node.function is not np.where or len(node.args) != 3:
         return None
@@ -774,9 +744,6 @@ def split_sum(value: Any, width: int) -> list[Term]:
 
 def _scale_terms(value: Node, parts: list[Term], factor: Any) -> list[Term]:
     """Return the terms of the product of a sum and a factor.
-
-    If the factor is a row of numbers, and a term of the sum has a value for each point, the product
-    is a single term.
 
     Args:
         value: the product.
