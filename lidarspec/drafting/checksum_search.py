@@ -1,8 +1,7 @@
 """Find the algorithm, the place and the covered bytes of the checksum of frames.
 
-All simple checksums are tried: XORs, sums of bytes and of words, their complements, XORs of words
-in groups, folded sums, and XORs that are stored in two nibbles. If none of them is certain, CRCs
-are calculated from the frames (`crc_search`).
+`search` tries all simple checksums, such as XORs and sums. If no simple checksum is certain,
+`crc_search` calculates CRCs from the frames.
 """
 
 from __future__ import annotations
@@ -127,7 +126,6 @@ class ChecksumWithConstant(Checksum):
 
     Attributes:
         base: the base checksum, which computes the value.
-        constant: the constant.
         negative: whether the value is subtracted from the constant.
     """
 
@@ -184,8 +182,7 @@ def search(
     Args:
         frames: whole frames of any lengths; some may be damaged. The result is more certain if
             there are more frames and if their content varies more.
-        quick: whether to stop after about a second. CRCs are then searched only at the usual
-            offsets, and for long frames only known CRCs are tried.
+        quick: whether to stop after about a second. Fewer offsets and fewer CRCs are tried.
         is_possible_place: a function that returns whether a checksum may be at a place.
     """
     samples = SampleFrames(frames)
@@ -213,20 +210,14 @@ def format_algorithm(algorithm: Checksum) -> str:
 
 
 def needs_class(algorithm: Checksum) -> bool:
-    """Return whether `lidarspec.spec` has no class for an algorithm.
-
-    A plugin must then contain the class.
-    """
+    """Return whether `lidarspec.spec` has no class for an algorithm."""
     return isinstance(algorithm, ChecksumWithConstant | WordSum)
 
 
 def iter_plain_matches(
     samples: SampleFrames, is_possible_place: Callable[[ChecksumPlace], bool] = accept_any_place
 ) -> Iterator[ChecksumMatch]:
-    """Yield the simple checksums that match: first of 4 bytes, then of 2, then of 1.
-
-    The search ends early if a match is certain.
-    """
+    """Yield the simple checksums that match, the widest first."""
     few = samples.take_spread(SCREENING_FRAMES)
     tried = 0
     has_sure = False
@@ -252,10 +243,7 @@ def iter_plain_matches(
 def _iter_checksums(
     samples: SampleFrames, place: ChecksumPlace, algorithms: Sequence[Checksum]
 ) -> Iterator[tuple[Checksum, CoveredSpan]]:
-    """Yield the algorithms and covered bytes to try for a place.
-
-    At least half of the bytes of the longest frame are covered.
-    """
+    """Yield the algorithms and covered bytes to try for a place."""
     longest = len(samples.frames[-1])  # the frames are sorted by length
     for span in iter_spans(place, samples):
         covered_bytes = sum(end - start for start, end in span.ranges(place, longest))
@@ -279,11 +267,7 @@ def _iter_matches(
     """Yield the matches of an algorithm, alone and combined with a constant.
 
     Args:
-        samples: all frames.
         few: some of the frames, on which the algorithm is tried first.
-        algorithm: the algorithm.
-        place: the offset and size of the checksum.
-        span: the covered bytes.
         tried: number of checksums tried so far; it reduces the certainty of a match.
     """
     computed = few.compute_checksums(algorithm, place, span)
@@ -329,11 +313,7 @@ def _list_variants(
 ) -> list[Checksum]:
     """Return an algorithm with each constant that makes most frames valid.
 
-    If there is only one frame, it cannot confirm a constant. For a sum, the result is then the sum
-    and its complement.
-
     Args:
-        algorithm: the algorithm.
         computed: the result of the algorithm for each frame, (n,).
         stored: the value at the place of the checksum in each frame, (n,).
         max_value: the largest value that can be stored.

@@ -1,17 +1,14 @@
 """Find a CRC of 8, 16 or 32 bits by polynomial division.
 
-Polynomials over GF(2) are integers: bit k is the coefficient of x**k. A CRC is the remainder of a
-message modulo its polynomial, so the polynomial divides the message followed by its CRC. It also
-divides the XOR of two frames of the same length, for any start value and final XOR of the CRC. The
-polynomial is therefore a divisor of the greatest common divisor of such XORs.
+Polynomials over GF(2) are integers: bit k is the coefficient of x**k. The XOR of two frames of the
+same length is divisible by the polynomial of their CRC. The polynomial is therefore a divisor of
+the greatest common divisor of such XORs.
 
-The start value and the final XOR are calculated from the polynomial. If the frames have several
-lengths, the two values are the solution of linear equations. If all frames have the same length,
-many pairs of values are equivalent, and the most usual pair is returned.
+The start value and the final XOR are calculated from the polynomial. If all frames have the same
+length, many pairs of values are equivalent, and the most usual pair is returned.
 
 If there are too few frames of the same length, the search assumes that the start value and the
-final XOR are 0 or all ones. With the contribution of these values removed, the polynomial divides
-each single frame.
+final XOR are 0 or all ones.
 """
 
 from __future__ import annotations
@@ -107,10 +104,8 @@ def find_common_divisor(polynomials: Iterable[int], *, floor: int = 0) -> int:
 def find_divisors(polynomial: int, degree: int) -> list[int]:
     """Return a polynomial's divisors of the given degree that may be CRC polynomials.
 
-    CRC polynomials have the constant term 1.
-
     Returns:
-        The divisors; an empty list if too many polynomials would have to be tried.
+        An empty list if too many polynomials would have to be tried.
     """
     if polynomial == 0:
         return []
@@ -152,8 +147,7 @@ def solve(equations: Sequence[tuple[int, int]], width: int) -> tuple[int, list[i
         width: number of bits of x.
 
     Returns:
-        One solution, and a basis of the null space. The XOR of the solution with basis vectors is
-        another solution. None if there is no solution.
+        One solution and a basis of the null space; None if there is no solution.
     """
     rows: dict[int, int] = {}
     for mask, bit in equations:
@@ -229,10 +223,9 @@ def iter_crc_matches(
     """Yield the CRCs that match, until a match is certain.
 
     Args:
-        samples: the frames.
-        mixed: True to search only for CRCs with different `refin` and `refout`, False to search
-            only for CRCs with equal `refin` and `refout`.
-        quick: whether to stop after a fixed amount of work. The usual offsets are tried first.
+        mixed: whether to search for CRCs with different `refin` and `refout`, instead of equal
+            values.
+        quick: whether to stop after a fixed amount of work.
         is_possible_place: a function that returns whether a CRC may be at a place.
     """
     if mixed:
@@ -286,23 +279,14 @@ def iter_crc_matches(
 
 
 def _estimate_cost(few: SampleFrames, reading: _BitOrder, *, by_catalogue: bool) -> int:
-    """Estimate the work of a search for candidates, as a number of bytes of CRC computation.
-
-    Args:
-        few: the frames from which the search calculates the candidates.
-        reading: the bit order.
-        by_catalogue: whether the search tries only the CRCs of the catalogue.
-    """
+    """Return the estimated work of a search, in bytes of CRC computation."""
     if by_catalogue:
         return few.shortest * len(reading.catalogue_crcs())
     return DIVISION_WORK * sum(map(len, few.frames))
 
 
 def _varies_like_crc(samples: SampleFrames, place: ChecksumPlace) -> bool:
-    """Return whether each byte of a possible checksum varies enough for a CRC.
-
-    A byte varies enough if it has enough distinct values in the sample frames.
-    """
+    """Return whether each byte of a possible checksum varies enough for a CRC."""
     if len(samples) < 2:
         return True
     min_distinct = max(min(len(samples) // 2, 24), 2)
@@ -337,7 +321,6 @@ def _iter_matches(
     """Yield the CRCs that match for one place, one span and one bit order.
 
     Args:
-        samples: all frames; a CRC must be valid for most of them.
         few: the frames from which candidates are calculated.
         tried: number of combinations of place, span and bit order that were tried so far.
         by_catalogue: whether to try only the CRCs of the catalogue.
@@ -377,8 +360,8 @@ def _iter_candidates(
     """Yield candidate CRCs.
 
     Yields:
-        A CRC; the number of frames from which its init and xorout were calculated; notes about
-        ambiguous parameters.
+        A CRC, the number of frames from which it was calculated, and notes about ambiguous
+        parameters.
     """
     ones = (1 << reading.width) - 1
     lengths = {size for size, _ in words}
@@ -435,14 +418,8 @@ def _iter_crcs(
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
     """Yield the likeliest CRC with a given polynomial.
 
-    Yields nothing if no pair of start value and final XOR matches the frames.
-
     Args:
-        words: the codewords of the frames.
-        poly: the polynomial.
-        reading: the bit order.
-        has_one_length: whether all frames have the same length, so that several pairs of start
-            value and final XOR match.
+        has_one_length: whether all frames have the same length.
     """
     first = dict(reversed(words))  # the first frame of each length
     remainders = {size: remainder(word, poly) for size, word in first.items()}
@@ -485,9 +462,7 @@ def _iter_crcs(
 def _solve_registers(
     remainders: dict[int, int], poly: int, reading: _BitOrder
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
-    """Calculate start value and final XOR from frames of several lengths; yield the CRC.
-
-    Yields nothing if no pair of values matches all frames.
+    """Yield the CRC of frames that have several lengths.
 
     Args:
         remainders: for each length, the remainder of a frame of this length modulo `poly`.

@@ -115,9 +115,6 @@ def make_draft_files(
     """Return the files of a distribution with a drafted sensor, as {path: text}.
 
     Args:
-        names: the names in the distribution.
-        link: the kind of the data link.
-        draft: the analysed frames.
         origin: a description of the capture.
         port: the UDP port to which the datagrams were sent; None if unknown.
     """
@@ -193,7 +190,6 @@ def add_to_distribution(
     """Return the new and changed files that add a sensor to an existing distribution.
 
     Args:
-        folder: the folder of the distribution.
         texts: the files of a distribution with only this sensor.
 
     Raises:

@@ -1,9 +1,7 @@
 """Analyse unknown frames, and describe them in a `Draft`.
 
 `make_draft` finds the structure of the frames at the beginning of a stream, and then splits all
-bytes into frames. Constant bytes at the start of frames are the sync bytes. A field with steadily
-rising values is not accepted as a checksum, because an XOR often matches such a field by
-coincidence.
+bytes into frames.
 """
 
 from __future__ import annotations
@@ -62,7 +60,6 @@ class RepeatedBlocks:
     Attributes:
         start: offset of the first block, in bytes.
         size: size of a block, in bytes.
-        count: number of blocks.
         flag: the constant first bytes of each block; b"" if there are none.
         rising_fields: the fields with rising values in a block.
     """
@@ -81,21 +78,21 @@ class RepeatedBlocks:
 
 @dataclass(frozen=True)
 class Draft:
-    """The known properties of the frames in some bytes.
+    """The properties that were found in unknown frames.
 
     Attributes:
         datagrams: whether each frame is a datagram.
         sync: the first bytes of every frame.
         size: the length of the frames, in bytes; None if it varies.
         length: the length field; None if all frames have one length.
-        frames: the offset and the bytes of each frame that has all known properties, in order.
+        frames: (offset, bytes) of each frame that has all known properties.
         bytes_in: number of input bytes.
         rising_fields: the fields with rising values, except those in the blocks.
         blocks: repeated blocks of a frame; None if a frame has no blocks.
         checksum: the checksum; None if none was found.
         others: further checksums that match the frames.
-        common_bytes: the number of bytes at the start of a frame in which fields are searched, if
-            the length field counts bytes; otherwise 0. Frames of fewer bytes are ignored.
+        common_bytes: the number of bytes at the start of a frame in which fields are searched; 0 if
+            the length field does not count bytes.
     """
 
     datagrams: bool
@@ -126,7 +123,7 @@ class Draft:
     def head_size(self) -> int:
         """The number of bytes before the part of varying length.
 
-        It is the length of the frame if all frames have the same length.
+        If all frames have the same length, this is the frame length.
         """
         if self.size is not None:
             return self.size
@@ -177,16 +174,7 @@ def make_draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
 
 
 def _find_sync(structure: FrameStructure, parts: Sequence[bytes], *, datagrams: bool) -> bytes:
-    """Return the first bytes of every frame.
-
-    These are `structure.sync`, unless all frames have the same length and other constant bytes are
-    found at their start.
-
-    Args:
-        structure: the structure of the frames.
-        parts: the datagrams, or the whole stream.
-        datagrams: whether each frame is a datagram.
-    """
+    """Return the bytes with which every frame begins."""
     if structure.period is None:
         return structure.sync
     if datagrams:
@@ -204,10 +192,7 @@ def _find_sync(structure: FrameStructure, parts: Sequence[bytes], *, datagrams: 
 
 
 def _find_constant_start(frames: Sequence[bytes]) -> bytes:
-    """Return the constant bytes at the start of frames of the same length; b"" if there are none.
-
-    Bytes that are all zero are not returned, because unused fields are often zero.
-    """
+    """Return the constant bytes at the start of frames of the same length."""
     rows = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), -1)
     usual = find_usual_bytes(rows[:, :MAX_SYNC_BYTES])
     min_share = MIN_CONSTANT_SHARE if len(rows) >= FEW_FRAMES else 1
@@ -269,16 +254,8 @@ def _has_valid_checksum(checksum: ChecksumMatch, frame: bytes) -> bool:
 
 
 def _find_count(draft: Draft, stream: bytes) -> Draft:
-    """Search for a length field with the help of an incomplete frame at the end.
-
-    A byte that is the same in all complete frames, but differs in the incomplete frame, is probably
-    a number of elements. Returns the draft with this length field, or the unchanged draft if there
-    is no such byte.
-
-    Args:
-        draft: the draft.
-        stream: all bytes; not used for datagrams.
-    """
+    """Return the draft with a length field found from an incomplete last frame."""
+    # a byte is probably a number of elements if only the incomplete frame has another value
     if draft.size is None or draft.datagrams or not draft.frames:
         return draft
     last_start, last_whole = draft.frames[-1]
@@ -318,10 +295,7 @@ def _find_count(draft: Draft, stream: bytes) -> Draft:
 
 
 def _find_common_bytes(draft: Draft, parts: Sequence[bytes]) -> Draft:
-    """Return the draft with `common_bytes`, and without frames of fewer bytes.
-
-    Frames of fewer bytes are probably of another type.
-    """
+    """Return the draft with `common_bytes`, and without frames of fewer bytes."""
     if draft.length is None or not draft.frames:
         return draft
     if draft.length.unit > 1:
@@ -335,11 +309,7 @@ def _find_common_bytes(draft: Draft, parts: Sequence[bytes]) -> Draft:
 
 
 def _find_checksums(draft: Draft) -> list[ChecksumMatch]:
-    """Return the checksums that match and that a struct can declare.
-
-    Matches at rising fields or at nearly constant bytes are left out, because they are probably a
-    coincidence.
-    """
+    """Return the checksums that match and that a struct can declare."""
     frames = [frame for _, frame in draft.frames]
     step = max(1, len(frames) // MAX_CHECKSUM_FRAMES)
     shortest = min(map(len, frames), default=0)
@@ -373,11 +343,7 @@ def _overlaps(place: ChecksumPlace, field: RisingField, length: int) -> bool:
 
 
 def _is_declarable(draft: Draft, match: ChecksumMatch) -> bool:
-    """Return whether a struct can declare the checksum.
-
-    The checksum must cover all other bytes, or one range. It must not be in the part of varying
-    length, or stored in nibbles.
-    """
+    """Return whether a struct can declare the checksum."""
     if match.is_in_nibbles:
         return False
     place = match.place
@@ -392,10 +358,7 @@ def _is_declarable(draft: Draft, match: ChecksumMatch) -> bool:
 
 
 def _find_blocks(draft: Draft) -> Draft:
-    """Return the draft with its repeated blocks, if there are any.
-
-    Fields in the blocks, in the checksum or in the sync bytes are removed from `rising_fields`.
-    """
+    """Return the draft with its repeated blocks, if there are any."""
     if not draft.frames:
         return draft
     blocks = None
@@ -421,7 +384,6 @@ def _choose_blocks(
 
     Args:
         rows: the frames, (n, length).
-        rising_fields: the rising fields of the frames.
     """
     blocks = _find_flagged_blocks(rows) or _find_blocks_of_fields(rising_fields, rows.shape[1])
     if blocks is None:
@@ -439,10 +401,7 @@ def _choose_blocks(
 
 
 def _find_flagged_blocks(rows: NDArray[np.uint8]) -> RepeatedBlocks | None:
-    """Return blocks that begin with the same two bytes and fill much of the frame.
-
-    Returns None if no blocks are found.
-    """
+    """Return blocks that begin with the same two bytes and fill much of the frame."""
     first = rows[0]
     is_constant = (rows == rows[0]).mean(axis=0) >= MIN_CONSTANT_SHARE
     pairs: dict[tuple[int, int], list[int]] = {}
@@ -476,11 +435,7 @@ def _are_similar(first: RisingField, second: RisingField) -> bool:
 
 
 def _find_blocks_of_fields(fields: Sequence[RisingField], length: int) -> RepeatedBlocks | None:
-    """Return blocks at equal distances that each begin with a similar rising field.
-
-    If there are several groups of such blocks, the group with the most bytes is returned. Returns
-    None if no blocks are found.
-    """
+    """Return blocks at equal distances that each begin with a similar rising field."""
     found_blocks = []
     for field in fields:
         offsets = [

@@ -83,7 +83,6 @@ def make_template_values(draft: Draft, *, origin: str, link_code: str) -> dict[s
     """Return the values for the template of a module, as {name: text}.
 
     Args:
-        draft: the analysed frames.
         origin: a description of the capture.
         link_code: the Python expression of the data link.
     """
@@ -172,10 +171,7 @@ def _iter_fields(draft: Draft) -> Iterator[DraftField]:
 
 
 def _find_known_fields(draft: Draft) -> list[DraftField]:
-    """Return the fields for which there is evidence, in wire order.
-
-    If two of them overlap, only one is returned.
-    """
+    """Return the fields with evidence, in wire order and without overlaps."""
     fields = list(_iter_sync_fields(draft))
     if (length := draft.length) is not None:
         sizes = sorted({len(frame) for _, frame in draft.frames})
@@ -209,11 +205,7 @@ def _find_known_fields(draft: Draft) -> list[DraftField]:
 
 
 def _iter_sync_fields(draft: Draft) -> Iterator[DraftField]:
-    """Yield the sync bytes as fields.
-
-    A field ends where the bytes that the checksum covers begin or end. Sync bytes in the first
-    block are omitted.
-    """
+    """Yield the sync bytes as fields."""
     if draft.blocks is None:
         end = len(draft.sync)
     else:
@@ -239,8 +231,7 @@ def _iter_unknown_fields(
         rows: the frames or blocks, (n, size).
         start: offset of the first unknown byte.
         end: offset after the last unknown byte.
-        cuts: offsets at which fields must be split. Fields are also split where constant bytes
-            begin and end.
+        cuts: offsets at which fields must be split.
     """
     edges = {start, end, *(cut for cut in cuts if start < cut < end)}
     if len(rows) >= FEW_FRAMES and end - start <= MAX_CONSTANT_SEARCH_BYTES:
@@ -278,8 +269,6 @@ def _make_rising_field(draft: Draft, rising: RisingField, container: str = "fram
     """Return the field for a counter, an angle or another rising field.
 
     Args:
-        draft: the analysed frames.
-        rising: the rising field.
         container: "frame" or "block", which contains the field.
     """
     code = _format_integer(rising.size, rising.order)
@@ -297,11 +286,7 @@ def _make_rising_field(draft: Draft, rising: RisingField, container: str = "fram
 
 
 def _find_start_field(draft: Draft, end_field: RisingField) -> RisingField | None:
-    """Return an earlier field that probably has the start value of `end_field`.
-
-    The value of `end_field` must nearly always be between the start values of its frame and of the
-    next frame.
-    """
+    """Return an earlier field that probably has the start value of `end_field`."""
     if end_field.kind == "counter":
         return None
     for field in draft.rising_fields:
@@ -427,10 +412,7 @@ def _format_checksum_arguments(
 
 
 def _find_span_edges(draft: Draft) -> list[int]:
-    """Return the offsets at which bytes covered by the checksum begin or end.
-
-    Offsets in the part of varying length are omitted.
-    """
+    """Return the offsets at which bytes covered by the checksum begin or end."""
     if draft.checksum is None or not draft.frames:
         return []
     shortest = min(len(frame) for _, frame in draft.frames)
@@ -485,11 +467,7 @@ def _format_alternatives(begin: str, names: Sequence[str]) -> str:
 
 
 def _format_max_length(draft: Draft) -> str:
-    """Return the value of `max_length`, in bytes.
-
-    A length field of one byte limits the length. Otherwise the limit is twice the length of the
-    longest frame in the capture, because longer frames may occur.
-    """
+    """Return the value of `max_length`, in bytes."""
     if draft.size is not None or draft.length is None:
         return str(draft.size)
     if draft.length.size == 1:
@@ -498,11 +476,7 @@ def _format_max_length(draft: Draft) -> str:
 
 
 def _make_imports(text: dict[str, str]) -> dict[str, str]:
-    """Return the template values with the imports, as {name: text}.
-
-    Args:
-        text: the template values with code. The names in this code are imported.
-    """
+    """Return the template values with the imports that their code requires."""
     code = "\n".join(text.values())
     construct = sorted(
         set(re.findall(r"\b(Array|Bytes|Const|Int\d+u[lb]|this(?=\.))\b", code)) | {"Struct"}

@@ -1,14 +1,12 @@
 """Find frames in unknown bytes, and fields with steadily rising values.
 
 `find_structure` finds the frames. If all frames have the same length, many bytes repeat at this
-interval, and the sync bytes are the longest run of constant bytes. If frames have several lengths,
-their sync bytes are a frequent pair of bytes, and a length field after the pair gives the distance
-to the next pair.
+interval. If frames have several lengths, a length field gives the distance from the sync bytes to
+the next sync bytes.
 
-`find_rising_fields` finds counters, angles that wrap at a full circle, and clocks. Their values
-rise from frame to frame by about the same step. If the byte order or offset is wrong, the values
-jump. The value at which an angle wraps gives its unit: an angle in hundredths of a degree wraps at
-36,000.
+`find_rising_fields` finds counters, angles and clocks. Their values rise from frame to frame by
+about the same step. The value at which an angle wraps gives its unit: an angle in hundredths of a
+degree wraps at 36,000.
 """
 
 from __future__ import annotations
@@ -98,7 +96,6 @@ class RisingField:
     Attributes:
         offset: offset in the frame or block, in bytes.
         size: size in bytes.
-        order: byte order.
         kind: "counter" rises by one each time; "angle" wraps at a full circle; "rising" is any
             other field that rises.
         circle: the value at which the field wraps; 0 if no wrap was seen.
@@ -154,8 +151,6 @@ class RisingField:
 
 def find_rising_fields(rows: NDArray[np.uint8]) -> list[RisingField]:
     """Return the rising fields of consecutive frames, sorted by offset.
-
-    If fields overlap, only the most certain is returned.
 
     Args:
         rows: the frames, or the first bytes of each frame, (n, size).
@@ -291,10 +286,7 @@ def _iter_rising(
 
 
 def _includes_low_byte(field_values: NDArray[np.int64]) -> bool:
-    """Return whether the lowest byte of the values belongs to the field.
-
-    If it does, the steps between the values vary clearly more without this byte.
-    """
+    """Return whether the lowest byte of the values belongs to the field."""
     steps = np.diff(field_values)
     moved = steps != 0
     coarse_steps = 256 * np.diff(field_values >> 8)
@@ -310,13 +302,9 @@ def _includes_low_byte(field_values: NDArray[np.int64]) -> bool:
 def _find_circle(highest: int, fallen: int, usual: int) -> int:
     """Return the value at which a field wraps.
 
-    If a full circle in a usual unit (such as 36,000) is near `highest` and `fallen`, the result is
-    this circle. Otherwise it is `fallen`.
-
     Args:
         highest: the highest value of the field.
         fallen: the sum of the decrease at a wrap and the usual step.
-        usual: the usual step.
     """
     near = [
         circle
@@ -335,7 +323,6 @@ class LengthField:
     Attributes:
         offset: offset of the field, in bytes.
         size: size of the field, in bytes.
-        order: byte order.
         unit: size of the counted elements, in bytes; 1 for a length in bytes.
         rest: number of bytes that the field does not count.
     """
@@ -372,7 +359,6 @@ class FrameStructure:
         period: the length of the frames; None if it varies.
         length: the length field, if the length varies.
         share: the share of the bytes that are in frames.
-        frames: the frames.
     """
 
     sync: bytes
@@ -419,10 +405,7 @@ def split_frames(data: bytes, period: int, start: int = 0) -> list[bytes]:
 
 
 def _find_in_datagrams(chunks: Sequence[bytes]) -> FrameStructure | None:
-    """Return the structure of the datagrams of one length.
-
-    The length whose datagrams have the most bytes in total is selected.
-    """
+    """Return the structure of the datagrams of one length."""
     if len(chunks) < MIN_FRAMES:
         return None
     lengths, counts = np.unique([len(chunk) for chunk in chunks], return_counts=True)
@@ -439,11 +422,7 @@ def _find_in_datagrams(chunks: Sequence[bytes]) -> FrameStructure | None:
 
 
 def _find_in_stream(data: NDArray[np.uint8]) -> FrameStructure | None:
-    """Return the structure of a stream, with frames of one or of several lengths.
-
-    If both are found, frames of several lengths are preferred if they contain clearly more bytes,
-    or if there are many of them and few frames of one length.
-    """
+    """Return the structure of a stream, with frames of one or of several lengths."""
     periodic = _find_fixed_length(data)
     varying = _find_varying_length(data)
     if periodic is None or varying is None:
@@ -455,11 +434,7 @@ def _find_in_stream(data: NDArray[np.uint8]) -> FrameStructure | None:
 
 
 def _find_fixed_length(data: NDArray[np.uint8]) -> FrameStructure | None:
-    """Return the structure of frames of the same length; None if none is found.
-
-    Distances at which most bytes are equal are tried. The result has the distance with the largest
-    share of constant bytes, or a shorter distance with nearly the same share.
-    """
+    """Return the structure of frames of the same length; None if none is found."""
     lags = np.arange(MIN_FRAME_BYTES, min(MAX_FRAME_BYTES, len(data) // MIN_FRAMES) + 1)
     equal = np.array([float((data[lag:] == data[:-lag]).mean()) for lag in lags])
     likely = lags[np.argsort(equal)[::-1][:MAX_DISTANCES]].tolist()
@@ -481,12 +456,8 @@ def _find_fixed_length(data: NDArray[np.uint8]) -> FrameStructure | None:
 
 
 def _split_groups(data: NDArray[np.uint8], whole: FrameStructure) -> FrameStructure:
-    """Return the structure of shorter frames if `whole` consists of groups of frames.
-
-    Frames can repeat in groups, for example because an index in the frames counts from 0 to 5.
-    Shorter frames are accepted if their sync bytes have at least two different values, or if they
-    have a counter. Otherwise, `whole` is returned.
-    """
+    """Return the structure of shorter frames if `whole` consists of groups of frames."""
+    # frames can repeat in groups, for example because an index in the frames counts from 0 to 5
     period = whole.period or 0
     for part_size in range(MIN_FRAME_BYTES, period // 2 + 1):
         if period % part_size:
@@ -507,11 +478,7 @@ def _has_counter(structure: FrameStructure) -> bool:
 def _iter_frames_of_length(
     data: NDArray[np.uint8], period: int
 ) -> Iterator[tuple[float, FrameStructure]]:
-    """Yield (weight, structure) of frames with the length `period`, if there are any.
-
-    The frames begin with the longest run of constant bytes. The weight is the share of constant
-    bytes, multiplied by the share of bytes in frames.
-    """
+    """Yield (weight, structure) of frames with the length `period`, if there are any."""
     count = len(data) // period
     rows = data[: count * period].reshape(count, period)
     usual = find_usual_bytes(rows)
@@ -538,16 +505,11 @@ def _iter_frames_of_length(
 def _is_chance(data: NDArray[np.uint8], constant_count: int, count: int, period: int) -> bool:
     """Return whether the number of constant bytes is probably a coincidence.
 
-    Chernoff's bound gives the probability that random bytes with the same distribution of values
-    have as many constant bytes. This probability is multiplied by the number of periods that are
-    tried.
-
     Args:
-        data: the data.
         constant_count: number of nonzero bytes of a period that are equal in each repetition.
         count: number of repetitions.
-        period: length of the period, in bytes.
     """
+    # Chernoff's bound for random bytes with the same distribution of values
     shares = np.bincount(data, minlength=256)[1:] / len(data)
     expected = period * float((shares**count).sum())
     if constant_count <= expected:
@@ -560,11 +522,7 @@ def _is_chance(data: NDArray[np.uint8], constant_count: int, count: int, period:
 
 
 def _find_longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[int, int]:
-    """Return (start, length) of the run with the most nonzero constant bytes.
-
-    A run may continue from the end of the period to its start. Zeros at the start of a run are
-    omitted, because zeros are frequent in all data.
-    """
+    """Return (start, length) of the run with the most nonzero constant bytes."""
     # Rotate so that the first byte is not constant. No run is then split.
     rotation = int(np.argmin(steady))
     best = (-1, 0, 0)
@@ -605,15 +563,10 @@ def _find_varying_length(data: NDArray[np.uint8]) -> FrameStructure | None:
 def _find_length_field(
     data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes
 ) -> FrameStructure | None:
-    """Return the structure of frames with given sync bytes; None if none is found.
-
-    The length field is the byte or word after the sync bytes that most often matches the distance
-    to the next sync bytes.
+    """Return the structure of frames with given sync bytes; None if there is none.
 
     Args:
-        data: the data.
         starts: offsets of the sync bytes, (n,).
-        sync: the sync bytes.
     """
     starts = starts[starts + MAX_LENGTH_FIELD_OFFSET + 2 < len(data)]
     steps = np.diff(starts)

@@ -115,7 +115,6 @@ class ChecksumMatch:
     """A checksum that matches sample frames.
 
     Attributes:
-        algorithm: the algorithm.
         place: the offset and size of the checksum in the frames.
         span: the covered bytes.
         order: the byte order of the stored checksum.
@@ -124,7 +123,6 @@ class ChecksumMatch:
         evidence_bits: the certainty: of 2**evidence_bits wrong checksums, one matches by
             coincidence.
         source: the Python source of the algorithm.
-        notes: remarks for the user.
         name: the name of a CRC in the catalogue; "" if it has none.
         is_ambiguous: whether the frames leave a choice of parameters.
         has_constant: whether the checksum includes a constant that was calculated from the frames.
@@ -165,11 +163,7 @@ class ChecksumMatch:
 
     @property
     def is_sure(self) -> bool:
-        """Whether the search can end with this match.
-
-        The match must have enough evidence and unique parameters. The checksum must be at the end
-        of the frame, or cover all bytes after it.
-        """
+        """Whether the search can end with this match."""
         at_end = self.place.offset < 0 and self.place.offset + self.place.size == 0
         return (
             self.evidence_bits >= SURE_EVIDENCE_BITS
@@ -185,9 +179,7 @@ def read_values(
 
     Args:
         rows: the frames, (n, length).
-        offset: offset of the value, in bytes.
         size: number of bytes, at most 7.
-        order: the byte order.
     """
     columns = rows[:, offset : offset + size].astype(np.int64)
     shifts = 8 * np.arange(size, dtype=np.int64)
@@ -290,10 +282,7 @@ class SampleFrames:
         )
 
     def iter_places(self, size: int) -> Iterator[ChecksumPlace]:
-        """Yield the possible places of a checksum, from both ends of the frame inwards.
-
-        Places with nearly constant values are omitted.
-        """
+        """Yield the possible places of a checksum, from both ends of the frame inwards."""
         last = self.shortest - size
         first = last if self.is_single else 0
         near = (
@@ -326,11 +315,7 @@ class SampleFrames:
         return len(self) == 1
 
     def measure_variation(self, place: ChecksumPlace) -> float:
-        """Return a measure of how much the bytes at a place vary.
-
-        The measure depends on the range and the number of distinct values of the byte that varies
-        least. It is higher for a place at the end of the frame, where checksums usually are.
-        """
+        """Return a measure of how much the bytes at a place vary."""
         columns = [
             self.read_field(ChecksumPlace(place.offset + index, 1), "little")
             for index in range(place.size)
@@ -350,10 +335,7 @@ def accept_any_place(_: ChecksumPlace) -> bool:
 
 
 def iter_spans(place: ChecksumPlace, samples: SampleFrames) -> Iterator[CoveredSpan]:
-    """Yield the possible spans of covered bytes, the most usual first.
-
-    If two spans cover the same bytes of the shortest frame, only the first is yielded.
-    """
+    """Yield the possible spans of covered bytes, the most usual first."""
     start = place.start(samples.shortest)
     before = start
     behind = samples.shortest - start - place.size
