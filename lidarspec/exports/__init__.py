@@ -1,9 +1,7 @@
 """Export the spec of a sensor to the formats of other tools.
 
-`export` returns the text of an export, which is selected by name. The modules below get the frame
-types from `list_frames`, and read their trees (`lidarspec.spec.tree`). They raise `ExportError` if
-a tree contains Python code, or if the target format cannot express the spec. Modules in reading
-order:
+`export` returns the text of an export, which is selected by name. `ExportError` is raised if the
+target format cannot express the spec. Modules in reading order:
 
 * `json`, `stubs`: the spec as data, and as types for an editor.
 * `reference`, `diagram`: a page in Markdown, and packet diagrams in SVG.
@@ -45,7 +43,7 @@ BYTE_EXPORTS = ("wireshark", "c", "ksy")
 
 
 class ExportError(UsageError):
-    """The target of an export cannot express the spec. The message states the reason."""
+    """The target format of an export cannot express the spec."""
 
 
 class UnknownExport(UnknownName):
@@ -56,8 +54,6 @@ class UnknownExport(UnknownName):
 
 def select_frame(sensor: Sensor, frame: str) -> Sensor:
     """Return a copy of the sensor with only one frame type, and no commands.
-
-    An export of the copy describes this frame type alone.
 
     Raises:
         UnknownFrame: if the sensor has no frame type of this name.
@@ -98,10 +94,7 @@ def export(sensor: Sensor, kind: str) -> str:
 
 
 def _make_line(text: str) -> str:
-    """Return a text as one printable line for a heading, comment or string.
-
-    Each export escapes its own special characters.
-    """
+    """Return a text as one printable line."""
     return escape_controls(" ".join(text.split()))
 
 
@@ -128,9 +121,8 @@ def list_frames(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame,
     """Return the frame types of a sensor that can be exported, in declared order.
 
     Args:
-        on_wire: whether the export describes the bytes as they are sent. Frame types with a wire
-            form (text or escaped bytes) are then omitted, because other languages cannot decode
-            them.
+        on_wire: whether to omit frame types with a wire form (text or escaped bytes), which other
+            languages cannot decode.
 
     Raises:
         ExportError: if the sensor has no frames until it is configured, if a frame contains Python
@@ -173,10 +165,7 @@ def _join_forms(forms: Mapping[str, str]) -> str:
 
 
 def find_references(node: tree.Node) -> list[tree.Ref]:
-    """Return the fields that the formulas in a node and its descendants use.
-
-    The formulas give sizes, counts, conditions, and values that a field must have.
-    """
+    """Return the fields that the formulas in a node and its descendants use."""
     formulas = [
         value
         for below in tree.nodes(node)

@@ -1,16 +1,10 @@
 """Generate a C99 header for a sensor.
 
-The header has functions that take the bytes of a frame: accessors, lengths, checksums and scaling.
-It does not depend on struct packing. `header` joins:
-
-* helper functions, which are the same for all sensors (``c_bytes.h`` in this folder),
-* a function for each checksum algorithm of the sensor; it takes the covered byte ranges as an
-  argument, so that all frame types share it,
-* for each frame type, the accessors of `lidarspec.exports.c_fields`, and functions that read a
-  whole frame. These functions return the length and the validity of the frame, and the stored and
-  the computed checksums.
-
-`frame_length` checks that a byte exists before it reads the byte.
+The functions of the header take the bytes of a frame, and do not depend on struct packing. `header`
+joins the helper functions in ``c_bytes.h``, a function for each checksum algorithm, and the
+functions of each frame type. The functions of a frame type are the accessors of
+`lidarspec.exports.c_fields`, and functions that return the length, the validity and the checksums
+of a frame.
 """
 
 from __future__ import annotations
@@ -295,11 +289,7 @@ def _join_statements(statements: Iterable[str]) -> str:
 
 
 def _iter_length_checks(layout: CLayout) -> Iterator[str]:
-    """Yield C checks of the fields that determine the length, in wire order.
-
-    Each check makes the C function return 0 if the bytes end before the field, or if the value of
-    the field is impossible.
-    """
+    """Yield C checks of the fields that determine the length, in wire order."""
     longest = layout.message.frame.max_length
     for entry in layout.entries:
         before = "".join(
@@ -349,10 +339,7 @@ def _format_checksum(
 def _iter_covered_spans(
     layout: CLayout, entry: CEntry, seal: Sealed, held: list[CEntry]
 ) -> Iterator[tuple[SizeFormula, SizeFormula]]:
-    """Yield the byte ranges that a checksum covers.
-
-    These are the declared range, or the whole struct without the fields that store the checksum.
-    """
+    """Yield the byte ranges that a checksum covers."""
     if seal.over is not None:
         first, last = (layout.find_whole(path) for path in seal.over)
         yield first.start, last.start + last.size
@@ -442,8 +429,6 @@ def _format_number(value: Any) -> str:
 
 def _format_check(entry: CEntry, wrong: str) -> str:
     """Return a C statement that returns 0 if the value of an entry is invalid.
-
-    For an entry in arrays, the statement checks all elements.
 
     Args:
         wrong: the C condition that is true if the value is invalid.

@@ -1,13 +1,8 @@
 """The offsets of fields as C expressions, and C functions that read the fields.
 
-`CLayout` walks a frame tree once and makes a `CEntry` for each node. An entry has the offset of the
-node as a C expression, its size, the conditions under which it is present, and the counts of the
-arrays around it. If an expression needs a length or count from the header, it calls the C function
-that reads this number, so that expressions stay short.
-
-`iter_functions` makes the C functions from the entries: accessors of fields, counts of arrays,
-tests for optional fields, and conversions to the field's unit and the SI unit. If several
-alternatives contain a field, its accessor uses the first alternative that is present.
+`CLayout` makes a `CEntry` for each node of a frame tree, with the offset of the node as a C
+expression. `iter_functions` makes the C functions from the entries: accessors of fields, counts of
+arrays, tests for optional fields, and conversions to the field's unit and the SI unit.
 """
 
 from __future__ import annotations
@@ -118,7 +113,6 @@ class CEntry:
 
     Attributes:
         path: the path of the node, without indices; for an array, its `axis`.
-        node: the node.
         start: the offset of the first byte of the node in the frame.
         size: the size of the node in bytes.
         depth: the number of arrays around the node.
@@ -189,11 +183,7 @@ class CEntry:
 
     @property
     def condition(self) -> str:
-        """The C condition under which a C function returns this field; "" for always.
-
-        If an array inside a bit block contains the field, the condition compares the arguments of
-        the function with `indices`.
-        """
+        """The C condition under which a C function returns this field; "" for always."""
         inside = [
             f"{name_index(self.depth + level)} == {number}"
             for level, number in enumerate(self.indices)
@@ -202,11 +192,7 @@ class CEntry:
 
 
 def format_size_arguments(node: tree.Node, depth: int) -> str:
-    """Return the arguments for calling a size function inside `depth` arrays.
-
-    The arguments are the frame and an index for each array. The indices are 0 if all elements have
-    the same size.
-    """
+    """Return the arguments for calling a size function inside `depth` arrays."""
     is_own = any(ref.info.axes for ref in find_references(node))
     if is_own:
         return format_arguments(depth)
@@ -217,7 +203,6 @@ class CLayout:
     """The entries of a frame type, in wire order.
 
     Attributes:
-        message: the frame type.
         name: a function that returns the C name for a path and an ending.
         size: size of a frame, in bytes.
 
@@ -234,10 +219,7 @@ class CLayout:
         self._visit(top)
 
     def find_entries(self, path: str) -> list[CEntry]:
-        """Return the entries of the numbers, bytes or bits at a path.
-
-        There are several entries if several alternative layouts contain the field.
-        """
+        """Return the entries of the numbers, bytes or bits at a path."""
         return [
             entry
             for entry in self.entries
@@ -323,11 +305,7 @@ class CLayout:
         return sum((self.compute_size(below) for below in self._iter_members(entry)), SizeFormula())
 
     def make_size_function_name(self, entry: CEntry) -> str:
-        """Return the name of the size function of a part with alternatives.
-
-        Parts with alternatives can be nested and have the same path, so a number in their names
-        makes them unique.
-        """
+        """Return the name of the size function of a part with alternatives."""
         choices = [
             node
             for node in tree.nodes(self.message.root)
@@ -374,10 +352,8 @@ class CLayout:
                 start = start + self.compute_size(below)
 
     def _iter_members(self, entry: CEntry) -> Iterator[CEntry]:
-        """Yield an entry for each member of a struct.
-
-        The entries have the start of the struct instead of the start of the member.
-        """
+        """Yield an entry for each member of a struct."""
+        # the entries have the start of the struct instead of the start of the member
         node = entry.node
         if isinstance(node, tree.Sealed):
             yield replace(entry, node=node.body)
@@ -472,11 +448,7 @@ def find_accesses(layout: CLayout, path: str) -> list[CEntry]:
 
 
 def iter_functions(layout: CLayout) -> Iterator[str]:
-    """Yield the C functions of all fields, in wire order.
-
-    The functions of a field in several alternatives are yielded once, in the place of the last
-    alternative.
-    """
+    """Yield the C functions of all fields, in wire order."""
     functions = [
         function for entry in layout.entries for function in dict.fromkeys(_iter_writers(entry))
     ]
@@ -492,10 +464,7 @@ Writer = Callable[[CLayout, str], Iterator[str]]
 
 
 def _iter_writers(entry: CEntry) -> Iterator[tuple[Writer, str]]:
-    """Yield (writer, path) for each C function of an entry.
-
-    The writer is a Python function that writes the C function of the node at `path`.
-    """
+    """Yield (writer, path) for each C function of an entry."""
     if isinstance(entry.node, tree.Block):
         for part in entry.node.parts:
             yield from ((_write_inner_count, axis) for axis in _find_inner_axes(part))
@@ -614,7 +583,6 @@ def _format_function(kind: str, name: str, depth: int, ways: list[tuple[str, str
     The C function returns 0 if no condition is true.
 
     Args:
-        kind: the C type of the result.
         depth: the number of arrays around the field.
         ways: the condition and the value of each alternative; the condition "" is always true.
     """

@@ -2,11 +2,8 @@
 
 A row has four bytes, and each field is a box. A repeated part is drawn once, with its count.
 
-A diagram is made in two steps. `_ItemBuilder` converts a frame tree to boxes in wire order
-(`DiagramBox`), and to groups that are repeated or optional (`BoxGroup`). `_Sheet` draws them from
-top to bottom. A box that crosses the end of a row continues in the next row. A group starts a new
-row and has a bracket at its right. A field that is too long, or that has no fixed length, is drawn
-as a cut row.
+`_ItemBuilder` converts a frame tree to boxes (`DiagramBox`) and groups of boxes (`BoxGroup`).
+`_Sheet` draws the boxes from top to bottom.
 """
 
 from __future__ import annotations
@@ -61,7 +58,6 @@ class BoxGroup:
 
     Attributes:
         label: the number of repetitions, or the condition under which the group exists.
-        items: the boxes and groups in the group.
         is_optional: whether some frames do not contain the group.
     """
 
@@ -95,8 +91,7 @@ class _ItemBuilder:
     Attributes:
         seals: the node with the checksum algorithm, by the path of the field that stores the
             checksum.
-        has_both_orders: whether the frame has numbers in both byte orders. Each number then shows
-            its byte order.
+        has_both_orders: whether the frame has numbers in both byte orders.
     """
 
     seals: Mapping[str, tree.Sealed]
@@ -186,10 +181,7 @@ class _ItemBuilder:
         return self._make_cell(node.info, node.name, 8 * size.number, detail, "bytes", start)
 
     def _make_block_cells(self, node: tree.Block, start: SizeFormula) -> list[DiagramBox]:
-        """Return a box for each contiguous run of bits of one value, in wire order.
-
-        The highest bit of each byte is first.
-        """
+        """Return a box for each contiguous run of bits of one value, in wire order."""
         segments = [
             (run.byte, run.low + run.mask.bit_count() - 1, run, part)
             for part in node.parts
@@ -211,10 +203,7 @@ class _ItemBuilder:
     def _make_run_cell(
         self, node: tree.Block, part: tree.Part, low: int, high: int, start: SizeFormula
     ) -> DiagramBox:
-        """Return the box of the bits `low` to `high` of a value.
-
-        The box shows the bit numbers if the value has bits in further boxes.
-        """
+        """Return the box of the bits `low` to `high` of a value."""
         width = high - low + 1
         name = (".".join(part.names) or node.name) + "".join(f"[{index}]" for index in part.indices)
         if high > low:
@@ -455,10 +444,7 @@ class _Sheet:
                 )
 
     def _draw_cut_row(self, cell: DiagramBox) -> None:
-        """Draw a field as one row with jagged cuts.
-
-        This is done if the field is too long to draw in full, or if it has no fixed length.
-        """
+        """Draw a field as one row with jagged cuts."""
         self._end_row()
         self._draw_offset(cell, 0)
         width = ROW_BITS * BIT_WIDTH_PX
@@ -473,7 +459,7 @@ class _Sheet:
         self.used = 0
 
     def _draw_offset(self, cell: DiagramBox, more: int) -> None:
-        """Write the offset of the current row to its left; a long formula takes two lines.
+        """Write the offset of the current row at the left of the row.
 
         Args:
             cell: the first field of the row.
@@ -553,10 +539,7 @@ def _touches(piece: Piece, other: Piece) -> bool:
 def _draw_label(
     x: float, y: float, width: float, cell: DiagramBox, fill: str = NAME_COLOUR
 ) -> Iterator[str]:
-    """Yield the name and the detail of a box in the largest font size that fits.
-
-    A name that does not fit in the smallest font size is written vertically.
-    """
+    """Yield the name and the detail of a box in the largest font size that fits."""
     room = width - 5
     if LETTER_ASPECT * MIN_NAME_SIZE_PX * len(cell.name) > room:
         cell = replace(cell, name=cell.name.rpartition(".")[2])

@@ -2,7 +2,7 @@
 
 docs/reference/spec-json.md describes every key. Wire types, bit positions, formulas and checksums
 are complete, so that a decoder can be written from them. Python code (`points`, `plausible`,
-`sweep`) is not included; the output only states whether a frame type has a `plausible` function.
+`sweep`) is not included.
 """
 
 from __future__ import annotations
@@ -101,10 +101,7 @@ def _to_json(fact: Any) -> Any:
 
 
 def link_data(link: Link) -> dict[str, Any]:
-    """Return a link as JSON data.
-
-    The key "kind" is the class of the link; the other keys are its attributes.
-    """
+    """Return a link as JSON data."""
     data = {"kind": type(link).__name__.lower(), **select_attributes(link, *vars(link))}
     if isinstance(link, Udp) and (rule := link.assembled) is not None:
         fragment = node_data(Frame(rule.struct, max_length=65_535).tree)
@@ -155,10 +152,7 @@ def _frame_data(message: ExportedFrame) -> dict[str, Any]:
 
 
 def _wire_form_data(form: WireForm) -> dict[str, Any]:
-    """Return the class and the arguments of a wire form as JSON data.
-
-    Arguments that are objects, such as a `HexCheck`, become Python text.
-    """
+    """Return the class and the arguments of a wire form as JSON data."""
     return {"form": type(form).__name__} | {
         name: repr(value) if dataclasses.is_dataclass(value) else _to_json(value)
         for name, value in _read_arguments(form).items()
@@ -197,7 +191,7 @@ def _command_data(command: Command) -> dict[str, Any]:
 
 
 def node_data(node: tree.Node) -> dict[str, Any]:
-    """Return a node of a frame as JSON data. The entry "kind" decides the other keys."""
+    """Return a node of a frame as JSON data."""
     match node:
         case tree.Struct():
             return {
@@ -285,10 +279,7 @@ def _parts_data(node: tree.PartSequence) -> dict[str, Any]:
 
 
 def formula_data(formula: tree.Formula | None) -> Any:
-    """Return a formula as JSON data.
-
-    Numbers stay numbers. A field is {"field": path}, an operation {"op": symbol, "args": [...]}.
-    """
+    """Return a formula as JSON data."""
     match formula:
         case tree.Ref():
             return {"field": formula.path}

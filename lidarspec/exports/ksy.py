@@ -1,15 +1,11 @@
 """Export a spec as a Kaitai Struct format for Kaitai's compiler, web IDE and visualizer.
 
-Each frame type, and each struct in a frame type, becomes a Kaitai type. A type has attributes in
-wire order (`seq`), calculated `instances`, `enums` and inner `types`. Types are plain data until
-`yaml` writes the document. Kaitai has no absolute paths, so formulas refer to a field by its path
-from the current type (`format_reference`).
+Each frame type, and each struct in a frame type, becomes a Kaitai type. Kaitai has no absolute
+paths, so formulas refer to a field by its path from the current type (`format_reference`).
 
 A bit block becomes bit-sized integers if its parts are consecutive in one of Kaitai's two bit
-orders. Otherwise the block becomes bytes, and an instance calculates each part. For a field with a
-scale, an instance has the physical value. For a field with named values, an instance has the name
-of the value. Kaitai cannot express checksums, plausibility tests and points. The documentation of a
-checksum's field names the algorithm.
+orders. Otherwise the block becomes bytes, and Kaitai calculates each part from the bytes. Kaitai
+cannot express checksums, plausibility tests and points.
 """
 
 from __future__ import annotations
@@ -128,12 +124,9 @@ def format_integer(formula: tree.Formula, scope: Scope) -> str:
 def _format_of_last_part(formula: tree.Formula, scope: Scope) -> str:
     """Return a formula that Kaitai evaluates after each part to find the last part.
 
-    Kaitai calls the part that was just read "_".
-
     Args:
-        formula: the formula. A path that begins with "_." is a field of the frame. Any other path
-            is a field of the part.
-        scope: the types around the parts.
+        formula: a path that begins with "_." is a field of the frame; any other path is a field of
+            the part.
     """
 
     def format_field(ref: tree.Ref) -> str:
@@ -232,10 +225,7 @@ def inline_block(
 
 
 def as_block(node: tree.Node) -> tree.Node:
-    """Return an integer of an unusual size as a block, any other node unchanged.
-
-    Kaitai has no type for integers of these sizes.
-    """
+    """Return an integer of an unusual size as a block, any other node unchanged."""
     if not isinstance(node, tree.Number) or node.kind == "float" or node.size in INTEGER_SIZES:
         return node
     targets = [
@@ -276,9 +266,7 @@ def _copy_condition(more: Mapping[str, Any]) -> Attribute:
 def _find_bit_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
     """Return the parts of a block as Kaitai reads them, and the order "be" or "le".
 
-    With "be", Kaitai begins with the highest bits; with "le", with the lowest bits. Returns None if
-    the block cannot be read in either order: the bits of each part must be consecutive, and the
-    parts must fill the block.
+    Returns None if Kaitai cannot read the block in either order.
     """
     if sum(part.bits.width for part in block.parts) != 8 * block.size:
         return None
@@ -292,10 +280,8 @@ def _find_bit_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
 
 
 def _find_starts(bits: BitField, suffix: str) -> set[int]:
-    """Return the positions at which the field begins, calculated from each segment.
-
-    If all segments give the same position, Kaitai can read the field as consecutive bits.
-    """
+    """Return the positions at which the field begins, calculated from each segment."""
+    # if all segments give the same position, Kaitai can read the field as consecutive bits
     ahead = ((segment, segment.low - segment.target) for segment in bits.segments)
     return {
         8 * segment.byte + (bits_ahead if suffix == "le" else 8 - bits.width - bits_ahead)
@@ -324,8 +310,8 @@ def _assemble_part(part: tree.Part, raw: str) -> str:
 def ksy(sensor: Sensor) -> str:
     """Return the sensor's frame types as a .ksy document.
 
-    The document parses a sequence of data frames. For a sensor without data frames, the document
-    parses a sequence of frames of the first type.
+    The document parses a sequence of data frames, or of frames of the first type if the sensor has
+    no data frames.
 
     Raises:
         ExportError: if Kaitai cannot express the spec: half-precision floats, Python code, or names
@@ -511,10 +497,7 @@ class _KaitaiWriter:
         kaitai.seq.append({"id": name, "type": name, **more})
 
     def _make_type(self, node: tree.Node, scope: Scope) -> Attribute:
-        """Return the Kaitai type of a node.
-
-        A node that is neither a struct nor a bit block is the member `value` of the type.
-        """
+        """Return the Kaitai type of a node."""
         if isinstance(node, tree.Struct | tree.Sealed):
             return self.make_struct_type(node, scope)
         kaitai = _KaitaiType()

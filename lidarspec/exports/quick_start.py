@@ -1,8 +1,7 @@
 """The start of a sensor's reference page: commands to copy, a program, and installation notes.
 
 The SOURCE in the commands is typical for the links of the sensor. The notes of a sensor are the
-file `notes/ID.md` in the package of its plugin. They describe wiring, connectors, addresses and
-settings from the manual.
+file `notes/ID.md` in the package of its plugin.
 """
 
 from __future__ import annotations
@@ -50,8 +49,7 @@ def list_commands(sensor: Sensor, source: str = "") -> list[tuple[str, str]]:
 def write_python(sensor: Sensor, source: str = "") -> str:
     """Return a Python program that prints the points of one scan.
 
-    For a sensor without points, the program prints a field of its first frame type, if possible
-    one with a unit.
+    For a sensor without points, the program prints a field of its first frame type.
     """
     source = source or typical_source(sensor)
     if not sensor.has_points:

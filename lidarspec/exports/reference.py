@@ -2,8 +2,7 @@
 
 The page has commands to copy, notes, links, the sensor's commands, a table of the fields of each
 frame, checksums, the clock and geometry. The notes come from the plugin; all other sections are
-made from the spec. The section on geometry decodes an example frame to get the columns of the
-points and the elevations of the channels.
+made from the spec.
 """
 
 from __future__ import annotations
@@ -270,11 +269,7 @@ def _decode_example(sensor: Sensor, name: str) -> PointCloud | None:
 
 
 def _list_channels(cloud: PointCloud) -> Sequence[tuple[str, str]]:
-    """Return the number and the elevation of each channel as texts.
-
-    Returns an empty list if the points of a channel have different elevations, or if there are too
-    many channels.
-    """
+    """Return the number and the elevation of each channel as texts."""
     if cloud.ring is None:
         return []
     rows = []

@@ -103,8 +103,7 @@ class _StubClasses:
         """Add the class of a struct or block, and return its name.
 
         Args:
-            name: the preferred name. If it is in use, a suffix is added.
-            docstring: the docstring of the class.
+            name: the preferred name; a suffix is added if it is in use.
         """
         while name in self.taken:
             name += "_"

@@ -1,15 +1,11 @@
 """Write a Wireshark dissector in Lua for a sensor.
 
 A dissector has two parts. ``wireshark.lua``, in the same folder, is the same for all sensors. It
-finds frames, computes their lengths, checks them, and fills Wireshark's tree. This module writes
-the part that depends on the sensor: a Lua table for each node of a frame tree (`_TableWriter`). A
-table has the kind of the node and the Wireshark field that shows it. The entry `keep` is set if
-later formulas use the value of the node. The entry `skip` is the number of bytes to skip while the
-length of a frame is computed.
+finds and checks frames, and fills Wireshark's tree. This module writes the part that depends on the
+sensor: a Lua table for each node of a frame tree (`_TableWriter`).
 
-A formula becomes a Lua function. Its argument is a table of the values of the fields with a `keep`
-entry. Numbers are floats in Wireshark's Lua, so integer operations are calls of functions in
-``wireshark.lua`` (`int.div`, `int.band`).
+A formula becomes a Lua function of the field values. Numbers are floats in Wireshark's Lua, so
+integer operations are calls of functions in ``wireshark.lua`` (`int.div`, `int.band`).
 """
 
 from __future__ import annotations
@@ -162,11 +158,7 @@ class _TableWriter:
         self.types: dict[str, str] = {}
 
     def node(self, node: tree.Node, path: str = "") -> Table:
-        """Return the table of a node.
-
-        The entry `skip` of the table is the size of the node in bytes. It is None if the bytes must
-        be read, because they must match a constant or a later formula uses their value.
-        """
+        """Return the table of a node."""
         match node:
             case tree.Number():
                 return self._make_number_table(node)
@@ -433,11 +425,7 @@ class _TableWriter:
         labels: Any = None,
         mask: int | None = None,
     ) -> LuaCode:
-        """Return Lua code that declares a Wireshark field, and add the field to `types`.
-
-        Wireshark requires that fields with the same name have types of the same family. If a field
-        with this name has another family, "_" is appended to the new name.
-        """
+        """Return Lua code that declares a Wireshark field, and add the field to `types`."""
         family = "".join(letter for letter in kind if letter.isalpha())
         if kind.endswith("64"):
             family += "64"
@@ -547,11 +535,7 @@ def _find_width(bits: int) -> int:
 
 
 def _find_word_order(block: tree.Block) -> str | None:
-    """Return the byte order with which a block can be read as one integer.
-
-    The bits of each part must be contiguous in the integer. Returns None if they are not, or if the
-    block has more than 4 bytes.
-    """
+    """Return the byte order in which a block is one integer; None if there is none."""
     orders = (
         order
         for order in ("big", "little")
@@ -617,8 +601,6 @@ local marks = {{
 
 def dissector(sensor: Sensor) -> str:
     """Return a Lua dissector for Wireshark.
-
-    Wireshark uses it for the sensor's UDP and TCP ports, and for captures of a serial line.
 
     Raises:
         ExportError: if Python code decides the contents of a frame.
