@@ -70,11 +70,7 @@ def _parse_assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]
 
 
 def _parse_raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
-    """Return the raw value of a field for a text.
-
-    For a field of bytes, the text is hexadecimal. For a number, the text is a label of the field,
-    or a number with or without a unit.
-    """
+    """Return the raw value that a text assigns to a field."""
     if info.kind == "bytes":
         return _parse_bytes(text, f"{place}: {path}")
     for raw, label in info.labels.items():
@@ -105,8 +101,7 @@ def _parse_number(text: str, unit: str, place: str, expected: str) -> tuple[Frac
     """Return the number and the unit in a text; the unit is "" if the text has none.
 
     Args:
-        text: a number, which may have a unit.
-        unit: the unit to convert to. It is used only if the text has a unit.
+        unit: the unit to convert to, if the text has a unit.
         expected: description of a valid text, for the error message.
     """
     digits, unit_text = split_unit(text)
@@ -145,11 +140,7 @@ def _to_raw(info: FieldInfo, number: Fraction, path: str, place: str) -> int | f
 
 
 def _find_length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
-    """Return the length of an array, as declared or calculated from count fields.
-
-    Returns 0 if the count fields are missing, but elements of the array are given. The caller then
-    makes the array as long as these elements require.
-    """
+    """Return the length of an array, as declared or calculated from count fields."""
     declared = table.arrays.get(path)
     if isinstance(declared, int):
         return declared
@@ -173,8 +164,7 @@ def _find_length(table: Schema, given: Mapping[str, Any], path: str, place: str)
 def parse_arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str, Any]:
     """Return the arguments of a command from texts "argument=value".
 
-    Numbers are converted to the units of their fields, and hexadecimal digits to bytes. Texts and
-    addresses are unchanged.
+    Numbers are converted to the units of their fields, and hexadecimal digits to bytes.
 
     Raises:
         UsageError: for an unknown command or argument, or an invalid value.

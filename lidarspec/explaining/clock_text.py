@@ -43,10 +43,7 @@ def _describe_epoch(report: ClockReport) -> str:
 
 
 def describe_offset(report: ClockReport) -> str:
-    """Return a text with the offset from the host's clock.
-
-    The difference between the time scales of sensor and host is subtracted from the offset.
-    """
+    """Return a text with the offset from the host's clock."""
     if math.isnan(report.error_s):
         reason = "the sensor's clock starts at an arbitrary time"
         if report.epoch in DATED_EPOCHS:

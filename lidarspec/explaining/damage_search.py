@@ -1,10 +1,8 @@
 """Find the single change of a frame that explains its damage.
 
-`find_changes` flips each bit, removes each byte, and inserts each byte value at each offset. Each
-result is a candidate. The parser of the frame type decides which candidates are valid frames, so
-this module does not know about checksums and lengths. If the checksum is short, several candidates
-may be valid by chance. If more than `MAX_DESCRIBED_CHANGES` are valid, only the kind of change is
-reported.
+`find_changes` flips each bit, removes each byte, and inserts each byte value at each offset. The
+parser of the frame type decides which of the results are valid frames. If the checksum is short,
+several results may be valid by chance.
 """
 
 from __future__ import annotations
@@ -48,8 +46,7 @@ class FrameChange(NamedTuple):
         kind: "flipped bit", "inserted byte" or "lost byte".
         offset: the offset of the changed or inserted byte in the damaged frame. For a lost byte,
             the offset of the byte that follows it.
-        value: the inserted or lost byte. For a flipped bit, the index of the bit; the lowest bit is
-            0.
+        value: the inserted or lost byte, or the index of the flipped bit, 0 for the lowest bit.
     """
 
     kind: str
@@ -72,14 +69,11 @@ def find_changes(
 ) -> list[FrameChange]:
     """Return the changes of a frame that each explain its damage alone.
 
-    A change explains the damage if undoing it gives one valid frame of the type, which
-    `Frame.plausible` accepts. The kinds are tried one after another, until changes of one kind
-    explain the damage.
+    A change explains the damage if a valid frame results when the change is undone.
 
     Args:
-        frame: the frame type.
         data: the damaged frame.
-        kinds: the kinds of change to try.
+        kinds: the kinds of change, tried in order until one kind explains the damage.
         offsets: the offsets at which changes are tried; None for all.
     """
     if not data:
@@ -99,12 +93,7 @@ def find_changes(
 
 
 def _find_max_size(engine: Codec, kind: str) -> int:
-    """Return the maximum length of a frame that is searched for changes, in bytes.
-
-    Args:
-        engine: parses the frame type.
-        kind: the kind of change to search.
-    """
+    """Return the maximum length of a frame that is searched for changes, in bytes."""
     is_compiled = isinstance(engine, CompiledCodec)
     if kind == "lost byte":
         if is_compiled and _count_layout_fields(engine.frame) <= MAX_LAYOUT_FIELDS:
@@ -128,11 +117,8 @@ def _iter_changes(
     """Yield the changes of one kind that explain the damage.
 
     Args:
-        kind: the kind of change.
         choices: number of changes of this kind to try at each offset.
-        data: the damaged frame.
         size: length of the undamaged frame.
-        engine: parses the frame type.
         chosen: the offsets at which changes are tried; None for all.
     """
     # A byte may be lost at the end too, which is one more offset than the damaged frame has.
@@ -206,12 +192,7 @@ def describe_damage(
 ) -> Iterator[str]:
     """Yield a sentence for each single change that explains the damage.
 
-    If there are more than `MAX_DESCRIBED_CHANGES` changes, a single sentence gives the kind of
-    change and the number of possible offsets.
-
     Args:
-        frame: the frame type.
-        data: the damaged frame.
         read_values: a function that returns the values of the fields of a frame, by path.
     """
     matching = find_changes(frame, data)

@@ -1,8 +1,7 @@
 """Explain one frame byte by byte: fields and values, the first fault, differences to another frame.
 
-`FrameRows` reads the fields of the frame up to the end of the bytes, so a truncated frame can be
-explained too. The explanation of a damaged frame names the single changes that explain the damage.
-The explanation of a valid data frame contains its points.
+The explanation of a damaged frame names the single changes that explain the damage. The explanation
+of a valid data frame contains its points.
 """
 
 from __future__ import annotations
@@ -158,8 +157,6 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
     A damaged or truncated frame is explained as far as possible, with its first fault.
 
     Args:
-        data: the bytes.
-        sensor: the sensor.
         frame: the frame type; by default the type that fits best.
 
     Raises:
@@ -278,10 +275,7 @@ def _add_points(
 
 
 def _find_parts_with_points(sensor: Sensor, name: str, data: bytes) -> list[str]:
-    """Return the paths of the parts with points, e.g. "segments[0]".
-
-    The list is empty if the points are not in parts.
-    """
+    """Return the paths of the parts with points, e.g. "segments[0]"."""
     frame = sensor.frames[name]
     path = sensor.parts_with("points", name)
     location = make_schema(frame.tree).split_part_path(path) if path else None
@@ -300,10 +294,7 @@ def _find_point_numbers(
 ) -> list[int]:
     """Return the indices of the points in a row.
 
-    The list is empty if the row is not an element of the innermost array with points.
-
     Args:
-        path: the path of the row.
         chain: the paths of the nested arrays that contain the points, outermost first.
         axes: the path of the array for each dimension of `numbers`; None for a dimension without an
             array.

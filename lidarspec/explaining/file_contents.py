@@ -125,7 +125,6 @@ class FileContents:
     """The contents of a file.
 
     Attributes:
-        path: the name of the file.
         kind: a description of the kind of the file.
         size: the size of the file, in bytes.
         header: the header of a recording; None for other files.
@@ -336,8 +335,7 @@ def _make_content(path: str, verdict: Verdict) -> SensorContent:
 def _measure(source: str, sensor: Sensor) -> dict[str, Any]:
     """Return statistics of the beginning of a file, as attributes of `SensorContent`.
 
-    The attributes are `reading`, `incomplete_returns`, `info` and `clock`. Returns an empty dict if
-    the frames cannot be decoded.
+    Returns an empty dict if the frames cannot be decoded.
     """
     try:
         with Device(source, sensor) as device:
@@ -358,11 +356,7 @@ def _measure(source: str, sensor: Sensor) -> dict[str, Any]:
 
 
 def format_contents(contents: FileContents) -> Iterator[str]:
-    """Yield the lines of the description of a file, with a column of labels.
-
-    Texts are folded between words at `LINE_WIDTH`. Commands are not folded, so that they can be
-    copied.
-    """
+    """Yield the lines of the description of a file, with a column of labels."""
     rows = _make_rows(contents)
     label_width = max(MIN_LABEL_WIDTH, *(len(label) for label, _ in rows))
     text_width = LINE_WIDTH - len(_format_row("", "", label_width))

@@ -39,8 +39,8 @@ class TextSpan(NamedTuple):
 class ExplainedPoint(NamedTuple):
     """One point of a cloud, in metres and degrees.
 
-    If there is no return, x, y and z are nan, and the range is inf. If the return is invalid, the
-    range is nan as well.
+    If there is no return, x, y and z are nan, and the range is inf. If the return is invalid, x, y,
+    z and the range are nan.
     """
 
     x: float
@@ -236,22 +236,14 @@ class ExplainedRow:
 
     @property
     def is_in_first_element(self) -> bool:
-        """Whether the row is in the first element of each array around it, or in no array.
-
-        Texts that are the same in all elements are shown only in the first element.
-        """
+        """Whether the row is in the first element of each array around it, or in no array."""
         return set(re.findall(r"\[(\d+)\]", self.path)) <= {"0"}
 
     def _format_values(self, *, alone: bool) -> list[str]:
         """Return each value as text.
 
-        The bits of a value are shown in the first element of an array, and omitted in later
-        elements.
-
         Args:
-            alone: whether the row is a single field, so that its text needs no name. In any other
-                row, a text begins with the name of its field, unless its unit occurs once in the
-                row.
+            alone: whether the row is a single field, so that its text needs no name.
         """
         if alone and self.remarks:
             return []
@@ -415,10 +407,7 @@ def format_ascii(data: bytes | bytearray) -> str:
 
 
 def hexdump(error: WireError) -> str:
-    """Return a hexdump of the bytes around an error; "" if the error has no bytes.
-
-    The last line of the text marks the invalid bytes and names their field.
-    """
+    """Return a hexdump of the bytes around an error; "" if the error has no bytes."""
     size = _count_marked_bytes(error)
     first = min(error.offset, len(error.data)) // HEXDUMP_LINE_BYTES * HEXDUMP_LINE_BYTES
     if error.offset == len(error.data) and first == len(error.data) and first:

@@ -25,10 +25,7 @@ class FrameRows:
     """The rows of one frame, which may be truncated.
 
     Args:
-        frame: the frame type.
-        data: the bytes.
-        fault: the fault of the frame, which the row of the faulty field reports; None if the frame
-            is valid.
+        fault: the fault of the frame; None if the frame is valid.
 
     Attributes:
         after: the offset after the frame.
@@ -64,10 +61,7 @@ class FrameRows:
         return axes
 
     def _read_fields(self, frame: Frame, struct: bytes) -> list[WireField] | None:
-        """Return the fields of the frame; the last field may be truncated.
-
-        Returns None if the frame type is not compiled and construct cannot parse the bytes.
-        """
+        """Return the fields of the frame; the last field may be truncated."""
         if isinstance(frame_layouts(frame), NotCompilableError):
             return list_plain_fields(frame, struct)
         examined = examine(frame.tree, struct, frame.max_struct_bytes)
@@ -88,11 +82,7 @@ class FrameRows:
         )
 
     def iter_rows(self) -> Iterator[ExplainedRow]:
-        """Yield a row for each field, bit block or array element.
-
-        An array element is one row if it contains no further array. For a frame with a wire form,
-        the bytes before and after its struct have rows as well.
-        """
+        """Yield a row for each field, bit block or array element."""
         if self._first:
             yield ExplainedRow(0, self._data[: self._first], "(start)", (), (), matches_spec=True)
         rows = itertools.groupby(self._fields, lambda field: self._find_row_path(field.block))
@@ -108,10 +98,7 @@ class FrameRows:
         return {value.path: value for row in self.iter_rows() for value in row.values}
 
     def iter_rest(self, fault: WireError | None) -> Iterator[ExplainedRow]:
-        """Yield a row with the bytes after the last field, if there are any.
-
-        These bytes belong to a truncated field, or they follow the end of the frame.
-        """
+        """Yield a row with the bytes after the last field, if there are any."""
         left = self._data[self.after :]
         if self._is_cut_off and fault is not None:
             yield ExplainedRow(
@@ -125,11 +112,7 @@ class FrameRows:
             )
 
     def _find_row_path(self, path: str) -> str:
-        """Return the path of the row that shows a field.
-
-        This is the path of the innermost array element around the field. It is the path of the
-        field itself if the field is in no array, or if the element contains further arrays.
-        """
+        """Return the path of the row that shows a field."""
         head, bracket, _ = path.rpartition("]")
         array = without_indices(head + bracket)[0]
         in_blocks = tuple(f"{block}." for block in self._blocks)

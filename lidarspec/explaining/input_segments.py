@@ -1,8 +1,7 @@
 """Split an input into pieces: valid frames, damaged frames, and the bytes between them.
 
 The decoder finds the valid frames, and `iter_pieces` yields each frame as soon as it is found.
-`explain_piece` searches the bytes between valid frames for damaged frames. A damaged frame begins
-with the constants at the start of a frame type. `_find_end` describes where it ends.
+`explain_piece` searches the bytes between valid frames for damaged frames.
 """
 
 from __future__ import annotations
@@ -41,8 +40,8 @@ class InputPiece:
     Attributes:
         offset: offset of the first byte in the input.
         data: the bytes.
-        frame: the frame type. It is "" for bytes that are not in a frame, and `NEAREST` for a short
-            input that is probably one damaged frame.
+        frame: the frame type; "" for bytes that are not in a frame; `NEAREST` for a short input
+            that is probably one damaged frame.
         is_datagram: for bytes that are not in a frame, whether they are from a datagram.
     """
 
@@ -71,15 +70,11 @@ def iter_pieces(
 ) -> Iterator[InputPiece]:
     """Yield the frames of the input and the bytes between them, in order.
 
-    A datagram that is not a frame is a piece of its own. If the whole input is short and contains
-    no valid frame, it is one piece of the type `NEAREST`.
+    If a short input contains no valid frame, the whole input is one piece of the type `NEAREST`.
 
     Args:
-        sensor: the sensor.
-        chunks: the input.
-        datagrams: whether each chunk is a datagram; otherwise it is a piece of a stream.
-        frame: the frame type that is selected if several types match the same bytes. The `after` of
-            this type is ignored.
+        datagrams: whether each chunk is a datagram, instead of a piece of a stream.
+        frame: the frame type that is selected if several types match the same bytes.
 
     Raises:
         UnknownFrame: if the sensor has no such frame type.
@@ -116,10 +111,7 @@ def iter_pieces(
 
 
 def _prefer_frame(sensor: Sensor, frame: str) -> Sensor:
-    """Return the sensor, changed so that a frame type is preferred.
-
-    The frame type is then the first, is incoming, and has no `after`.
-    """
+    """Return the sensor, changed so that a frame type is preferred."""
     first = replace(sensor.frames[frame], direction="in", after=None)
     return with_frames(
         sensor,
@@ -164,11 +156,8 @@ def explain_piece(
     """Yield a piece with its explanation.
 
     Bytes without a valid frame are split into damaged frames and the bytes between these frames.
-    Each part is then yielded as a piece.
 
     Args:
-        sensor: the sensor.
-        piece: the piece.
         frame: the frame type by which a piece of the type `NEAREST` is explained; by default the
             type that fits best.
 
@@ -219,12 +208,7 @@ def _iter_damaged(sensor: Sensor, piece: InputPiece) -> Iterator[InputPiece]:
 
 
 def find_likely_starts(sensor: Sensor, data: bytes) -> list[int]:
-    """Return the offsets at which a frame may begin, in ascending order.
-
-    At such an offset, the bytes match the constants at the start of an incoming frame type, and at
-    least one more byte follows. Types that begin with fewer than `MIN_SYNC_BYTES` constant bytes
-    are ignored.
-    """
+    """Return the offsets at which a frame may begin, in ascending order."""
     starts: set[int] = set()
     for frame in sensor.incoming.values():
         prefix = get_codec(frame).prefix
@@ -248,23 +232,14 @@ def _find_nearest_type(sensor: Sensor, data: bytes) -> str:
 
 
 def _find_headless_type(sensor: Sensor, data: bytes) -> str:
-    """Return the type of a frame that is damaged at its start.
-
-    Returns "" if no single change to a frame of any type explains the damage.
-    """
+    """Return the type of a frame that is damaged at its start; "" if unknown."""
     return next((name for name, frame in sensor.incoming.items() if find_changes(frame, data)), "")
 
 
 def _find_end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int]) -> int:
     """Return the offset at which a damaged frame ends.
 
-    An offset in `ends` is preferred at which the frame has the length of its type, or one byte more
-    or less. If there is none, the end is estimated.
-
     Args:
-        data: the bytes.
-        start: the start of the damaged frame.
-        name: the type of the damaged frame.
         ends: the offsets at which another frame may begin, and the end of the data.
     """
     following = [end for end in ends if end > start]

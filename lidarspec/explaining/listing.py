@@ -1,8 +1,6 @@
 """List an explained frame, and the differences between two frames, as lines.
 
-A frame has a line for each row. The line is indented by the nesting of the structs, and lines with
-the bits of bit fields follow. A difference has a line for its field, followed by lines with the
-bits that differ. A line consists of spans with roles, from which a terminal chooses colours.
+A line consists of spans with roles, from which a terminal chooses colours.
 """
 
 from __future__ import annotations
@@ -46,10 +44,7 @@ def join_text(line: Line) -> str:
 
 
 def fold(line: Line, width: int) -> Line:
-    """Insert line breaks into a line that is wider than `width` characters.
-
-    Continuation lines are indented to the column after offset, bytes and name.
-    """
+    """Insert line breaks into a line that is wider than `width` characters."""
     indent = sum(len(span.text) for span in line[:COLUMN_COUNT])
     if len(join_text(line)) <= width or indent + MIN_FOLDED_WIDTH > width:
         return line
@@ -80,7 +75,6 @@ class Listing:
     """Formats the rows of a frame as lines with aligned columns.
 
     Args:
-        rows: the rows.
         every: whether to draw the bits of all elements of an array, instead of only the first.
     """
 
@@ -191,7 +185,6 @@ def list_differences(differences: list[FieldDifference], sizes: tuple[int, int])
     """Yield lines with the differences of two frames, and a last line with a summary.
 
     Args:
-        differences: the fields that differ.
         sizes: the sizes of the frames, in bytes.
     """
     for missing, group in groupby(differences, lambda difference: difference.missing):
