@@ -5,9 +5,8 @@ Lidars of vacuum cleaners, which send without a request. The host drives the mot
 Source: the drivers kaiaai/LDS (LDS_DELTA_2A and related classes, LDS_LDS08RR) and lds2d; two
 packets of a Delta-2A from another driver's tests. There is no public manual. A packet has only the
 angle of its first sample. A packet covers 360 degrees divided by the number of packets per
-revolution, which is 16, or 15 for a 2G. One driver computes the sum modulo FFFF (hexadecimal)
-instead of modulo 10000, which is an error. The zero offset in the packets is not added to the
-angles, as in the drivers.
+revolution, which is 16, or 15 for a 2G. The zero offset in the packets is not added to the angles,
+as in the drivers.
 """
 
 from __future__ import annotations
@@ -107,11 +106,7 @@ def points(f: Fields, packets: int) -> Polar:
 
 
 def starts_on_grid(f: Fields, packets: int) -> Any:
-    """Return whether the start angle is a multiple of a packet's angle, but not 0.
-
-    A packet covers 360 degrees divided by `packets`, the number of packets per revolution. The
-    start angle 0 is left out, because it does not identify a model.
-    """
+    """Return whether the start angle is a multiple of a packet's angle, but not 0."""
     return (f.start_angle > 0) & (f.start_angle % (360 / packets) == 0)
 
 
@@ -119,7 +114,6 @@ def sweep(i: int, packets: int, count: int) -> dict[str, float]:
     """Return the simulated values of packet i.
 
     Args:
-        i: the number of the packet.
         packets: packets per revolution.
         count: samples per packet.
     """

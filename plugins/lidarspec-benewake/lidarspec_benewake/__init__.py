@@ -7,9 +7,8 @@ and its data sheet A00; TF-Luna manual A05, section 5, appendices I and II. The 
 sends the same frames with other data in place of the temperature, and has other commands. Distances
 are in centimetres by default. Frames do not contain the unit, so use ``configure(unit="mm")`` after
 the command `set_unit_mm`. Text formats and formats with a time are not supported. A TF-Luna ignores
-the checksum of commands, which is a sum, and its manual prints commands with the sum 00. The other
-models check the sum. In the TFmini-S manual, the replies to reset, factory settings and save are
-printed with the sums of their commands. In this module, each reply has the sum of its own bytes.
+the checksum of commands, so its manual prints commands with the checksum 00. The TFmini-S manual
+prints the replies to reset, factory settings and save with the checksums of their commands.
 """
 
 from __future__ import annotations
@@ -88,7 +87,7 @@ def make_data_frame(unit: str) -> Frame:
 def points(f: Fields) -> Polar:
     """Return one point straight ahead.
 
-    It is invalid if its strength or distance is unreliable according to the manual.
+    The point is invalid if its strength or distance is unreliable according to the manual.
     """
     unreliable = (
         (f.strength < MIN_STRENGTH) | (f.strength == SATURATED_STRENGTH) | (f.distance > 20)
@@ -107,10 +106,7 @@ def make_message(size: int, *fields: Any, out: bool = False) -> Frame:
 
 
 def is_known_reply(f: Fields) -> Any:
-    """Return whether the id belongs to a reply of one byte.
-
-    These are the replies to reset, format, output, factory settings and save.
-    """
+    """Return whether the id belongs to a reply of one byte."""
     return (
         (f.id == RESET) | (f.id == FORMAT) | (f.id == OUTPUT) | (f.id == FACTORY) | (f.id == SAVE)
     )

@@ -4,10 +4,9 @@ Source: the vendor's SDK ce30_driver 1.3 (packet.h, packet.cpp, udp_socket.h, RE
 driver in MATLAB (LidarDriver, ce30Sensor.m and ce30_ExtractAngleDist.m), which agree. A scan is
 sent in 27 packets of 12 columns, so the last packet has 4 columns beyond the field of view. The
 header has 42 bytes. Its content is not documented, except for one bit that marks a grey image. The
-byte order of the time is uncertain, because the SDK shifts the time by more bits than the time has.
-The time is therefore not used, and points have the host's time. Grey images are not read, and
-replies to other commands are not known. The y axis is assumed to point to the left, as in the point
-cloud of the SDK. The simulated rate is assumed.
+byte order of the time is uncertain, so points have the host's time. Grey images are not read. The y
+axis is assumed to point to the left, as in the point cloud of the SDK. The simulated rate is
+assumed.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """Camsense X1, and the LDS08RR with the same packets: 360 degree lidars of vacuum cleaners.
 
-They rotate and send without a request.
+The lidars rotate and send without a request.
 
 There is no public manual. Source: packets of both lidars (thijses/camsense-X1, "a few data
 packets"; kaiaai/LDS, issue 17), all with valid checksums, and the drivers kaiaai/LDS
 (LDS_CAMSENSE_X1, LDS_LDS08RR_CAMSENSE) and lds2d. The drivers call the checksum an unknown CRC-16,
-but it is a folded sum over all bytes before it. Two different sensors are called LDS08RR. The other
-LDS08RR sends packets of 3iRobotix, which begin with AA.
+but it is a folded sum over all bytes before it. Another sensor with the name LDS08RR sends packets
+of 3iRobotix, which begin with AA.
 """
 
 from __future__ import annotations
@@ -90,21 +90,14 @@ def make_data_frame(form: int, count: int, *rest: Construct) -> Frame:
 
 
 def plausible(f: Fields) -> Any:
-    """Return whether the angles are between 0 and 360 degrees.
-
-    The drivers reject raw values below A000.
-    """
+    """Return whether the angles are between 0 and 360 degrees."""
     return (f.start_angle >= 0) & (f.start_angle <= 360) & (f.end_angle >= 0) & (f.end_angle <= 360)
 
 
 def points(f: Fields, count: int, zero: float = 0.0) -> Polar:
     """Return points at even steps from the start angle to the end angle, clockwise.
 
-    The direction is the same as in the drivers, which draw correct maps.
-
     Args:
-        f: the fields of n packets.
-        count: samples per packet.
         zero: the angle in degrees added to all samples.
     """
     clockwise = spread(f.start_angle, f.end_angle, count, full=360.0)  # degrees, (n, count)
@@ -117,10 +110,7 @@ def points(f: Fields, count: int, zero: float = 0.0) -> Polar:
 
 
 def configure(sensor: Sensor, *, zero: Literal["data", "housing"] = "data") -> Sensor:
-    """Return the X1 with angles from the zero direction of the data or the housing.
-
-    The vendor's SDK counts angles from the zero direction of the housing.
-    """
+    """Return the X1 with angles from the zero direction of the data or the housing."""
     offset = HOUSING_ZERO_DEG if zero == "housing" else 0.0
     return dataclasses.replace(sensor, points=partial(points, count=8, zero=offset))
 
@@ -129,7 +119,6 @@ def sweep(i: int, count: int, steps: int, speed: float) -> dict[str, float]:
     """Return the simulated values of packet i.
 
     Args:
-        i: the number of the packet.
         count: samples per packet.
         steps: samples per revolution.
         speed: revolutions per minute.

@@ -124,10 +124,7 @@ def sweep(i: int) -> dict[str, Any]:
 
 
 def directions(i: int) -> tuple[Any, Any]:
-    """Return the simulated beams of packet i, as azimuth and elevation in radians.
-
-    A packet is a line from right to left, 60 degrees wide; a scan is 22 degrees high.
-    """
+    """Return the simulated beams of packet i, as azimuth and elevation in radians."""
     return np.linspace(-np.pi / 6, np.pi / 6, MAX_POINTS_PER_PACKET), np.deg2rad(
         i % SIMULATED_PACKETS * 22 / SIMULATED_PACKETS - 11
     )

@@ -1,6 +1,6 @@
 """CSPC M1C1_Mini (two versions), COIN-D4, COIN-D4A and COIN-D6: 360 degree lidars.
 
-The host starts them over a UART. They measure by triangulation or by time of flight.
+The host starts the lidars over a UART. The lidars measure by triangulation or by time of flight.
 
 Source: CSPC M1C1_Mini development manual, sections 1 and 2. Facts that the manual lacks come from
 the vendor's SDK (ros_cspc_lidar_coin_d4a, sdk/lidar_information.h), the manual's edition v1.1
@@ -10,11 +10,9 @@ Known errors of the manual: The printed sum of the device information, 0x0402, s
 in v1.1. In the angle example, the corrections 10.9442 and 11.8653 degrees should be 10.9445 and
 11.8674 (at 1000 and 8000 mm), and 71.1718 should be 71.171875.
 
-Known gaps of the manual: The figure with the order of the checksum is missing; the grouping in this
-module fits every captured packet. The baud rate is missing, and so is the command for the announced
-switch between 5.5 and 7 Hz. There is no rule for packets that cross 360 degrees or have one sample
-(the formula divides by LSN - 1). A COIN-D4 sends the fillers FE and FF, and FA FA once, which no
-manual mentions.
+Known gaps of the manual: The order of the checksum is missing; the grouping in this module fits
+every captured packet. The baud rate is missing. There is no rule for packets that cross 360 degrees
+or have one sample. A COIN-D4 sends the fillers FE, FF and FA FA, which no manual mentions.
 
 Of a COIN-D4A only the vendor's driver is public. Facts about the COIN-D6 come from other people's
 captures: 10 revolutions a second, 400 points per revolution, and an unexplained frame every three
@@ -167,7 +165,7 @@ AUXILIARY = Checksummed(
 def make_angle() -> Construct:
     """Return the struct of the first or the last angle of a packet (FSA or LSA).
 
-    It has the angle in steps of 1/64 degree, and then a check bit. Source: manual 2.2.3.
+    Source: manual 2.2.3.
     """
     return ByteSwapped(
         BitStruct(
@@ -234,8 +232,7 @@ OLDER_DATA = make_data(
 def is_ack_plausible(f: Fields) -> Any:
     """Return whether the mode is that of a reply: 50 to 5F.
 
-    Commands have the modes F0 to FF. The mode of a reply is the mode of its command XOR A0 (manual
-    2.1.3, SDK).
+    Source: manual 2.1.3 and SDK.
     """
     return (f.mode >= 0x50) & (f.mode <= 0x5F)
 
@@ -243,7 +240,7 @@ def is_ack_plausible(f: Fields) -> Any:
 def plausible(f: Fields) -> Any:
     """Return whether angles are below 360 degrees and the sample count fits.
 
-    A packet has at least one sample, and a start packet has exactly one sample (manual 2.2.3, M&T).
+    Source: manual 2.2.3, M&T.
     """
     return (
         (f.fsa.angle < 360)
@@ -256,7 +253,7 @@ def plausible(f: Fields) -> Any:
 def correction(distance: Any) -> Any:
     """Return the angle correction in degrees; 0 if there is no return.
 
-    `distance` is in metres. Source: manual 2.2.3, AngCorrect; the distance there is in millimetres.
+    `distance` is in metres. Source: manual 2.2.3, AngCorrect.
     """
     mm = np.maximum(distance * 1000, 1)
     return np.where(distance > 0, np.rad2deg(np.arctan(19.16 * (mm - 90.15) / (90.15 * mm))), 0)
@@ -265,11 +262,7 @@ def correction(distance: Any) -> Any:
 def directions(f: Fields, zero: str) -> tuple[Any, Any]:
     """Return the angles of the samples in degrees, uncorrected and corrected.
 
-    Uncorrected angles are evenly spaced from FSA to LSA, relative to the zero direction of the
-    data. Corrected angles (manual 2.2.3) are clockwise from the zero direction of the data, or from
-    the mark on the housing if `zero` is "housing". If the sensor reports that it does not turn
-    clockwise, the sent angles are assumed to be counter-clockwise; the manual describes only
-    clockwise rotation.
+    Corrected angles are relative to the direction that `zero` selects (manual 2.2.3).
     """
     raw = spread(f.fsa.angle, f.lsa.angle, f.lsn, full=360.0)  # degrees, (n, LSN)
     corrected = raw - np.where(f.state.info.correction == 1, correction(f.samples.distance), 0)
@@ -279,8 +272,6 @@ def directions(f: Fields, zero: str) -> tuple[Any, Any]:
 
 def points(f: Fields, zero: str = "data", has_exposure: bool = False) -> Polar:
     """Return the points of a packet.
-
-    The times of the points are calculated from the latest reported speed.
 
     Args:
         has_exposure: whether to add the column `exposure`.
@@ -310,9 +301,8 @@ def configure(
 ) -> Sensor:
     """Return a sensor with angles from the zero direction of the data or the housing.
 
-    Angles are sent relative to the zero direction of the data. On an M1C1_Mini, this direction is
-    12 degrees clockwise from the mark on the housing (manual 2.2.2, bytes 13 and 14; edition v1.1,
-    page 4, for the direction). The manual does not state whether the host should add these degrees.
+    On an M1C1_Mini, the zero direction of the data is 12 degrees clockwise from the mark on the
+    housing (manual 2.2.2, bytes 13 and 14; edition v1.1, page 4).
     """
     return dataclasses.replace(sensor, points=partial(points, zero=zero))
 
@@ -321,16 +311,12 @@ def configure(
 class RotationSweep:
     """The simulated values of each packet, while the sensor turns at one speed.
 
-    A revolution consists of a start packet, packets of 25 samples, and a shorter packet. Three
-    revolutions after a change of the speed, the exposure changes as well (manual 2.2.3).
-
     Attributes:
         hertz: revolutions per second.
         steps: points per revolution.
         exposure: the exposure at the beginning.
         previous_values: the values of the packets that complete the previous revolution, which has
             another speed.
-        firmware: the customer firmware.
         exposure_follows_speed: whether the exposure follows the speed, as on an M1C1_Mini.
     """
 
@@ -379,8 +365,6 @@ def change_speed(sweep: RotationSweep, i: int, hertz: float) -> RotationSweep:
     """Return a sweep that has a new speed from the next start packet on.
 
     Args:
-        sweep: the sweep before the change.
-        i: the number of the packet at which the speed is set.
         hertz: the new revolutions per second. The points per second do not change.
     """
     values = map(sweep, itertools.count(i))
@@ -404,10 +388,7 @@ def older_sweep(i: int) -> dict[str, float]:
 
 
 def make_request(mode: str, **more: Any) -> Command:
-    """Return a command whose acknowledgement has the same mode as the command.
-
-    The command is sent again if no reply arrives, because a repetition has no further effect.
-    """
+    """Return a command whose acknowledgement has the same mode as the command."""
     return Command(
         "command", {"mode": mode}, reply="ack", matches={"mode": mode}, retries=1, **more
     )
@@ -418,8 +399,7 @@ def make_start_packets(
 ) -> tuple[Any, ...]:
     """Return the simulated replies to the start command.
 
-    A sensor acknowledges the command, and sends fillers until its speed has settled. It then sends
-    noise and its device information (manual 1b, 2.1.3 and 2.2).
+    Source: manual 1b, 2.1.3 and 2.2.
     """
     return (
         ("ack", {"firmware": firmware}),
@@ -433,18 +413,13 @@ def make_start_packets(
 def has_customer_firmware(f: Fields) -> Any:
     """Return whether a packet has the upper bits of M&T set, but no start flag.
 
-    A CSPC lidar sends its customer firmware in these bits, and only in the first packet after a
-    start packet (manual 2.2.3, M&T).
+    Source: manual 2.2.3, M&T.
     """
     return (f.mt.start == 0) & (f.mt.m > 0)
 
 
 def has_bits_beside_firmware(f: Fields) -> Any:
-    """Return whether the upper bits of M&T differ from the customer firmware.
-
-    The customer firmware is sent in the packet after a start packet, and is the same in each
-    revolution. The first packet of a batch is ignored, because the packet before it is not known.
-    """
+    """Return whether the upper bits of M&T differ from the customer firmware."""
     begins = np.asarray(f.mt.start == 1)
     values = np.asarray(f.mt.m)
     follows_start = np.concatenate([np.zeros_like(begins[:1]), begins[:-1]])
@@ -585,8 +560,7 @@ M1C1_MINI_V11 = Sensor(
 def make_coin(model: str, **facts: Any) -> Sensor:
     """Return a sensor of the COIN series, which measures by time of flight.
 
-    It is derived from the M1C1_Mini, and its angles need no correction. `facts` are the arguments
-    of `Sensor` that this model changes.
+    `facts` are the arguments of `Sensor` that this model changes.
     """
     name = f"cspc-{model.lower()}"
     return dataclasses.replace(

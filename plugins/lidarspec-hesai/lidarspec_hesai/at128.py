@@ -1,19 +1,18 @@
 """Hesai AT128: protocol 4.3, packets of 2 blocks of 128 channels.
 
 A packet has 1086 bytes, 1118 with a signature. A mirror with three faces sweeps the beams over 120
-degrees to the front, and a scan is the sweep of one face. The azimuth of a block is the angle of
-the mirror, and the beam turns by twice this angle. The azimuth of a point is therefore twice the
-mirror's angle from the start of the face, plus the azimuth of the channel, plus a correction for
-the channel. The unit's file has the corrections for every two degrees of the mirror. Between faces,
-the sensor sends nothing, and the azimuth jumps by about 60 degrees.
+degrees to the front, and a scan is the sweep of one face. The beam turns by twice the angle of the
+mirror. The azimuth of a point is therefore twice the mirror's angle from the start of the face,
+plus the azimuth of the channel, plus a correction for the channel. The unit's file has the
+corrections for every two degrees of the mirror.
 
-The CRCs are probably the same as in packets of a QT128. No captured packet was available, so they
-are not verified.
+The CRCs are probably the same as in packets of a QT128. No captured packet was available, so the
+CRCs are not verified.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v4_3.h, udp4_3_parser.cc: packet, correction file 1.5, jump
 of 10 degrees, axes as in its code; correction files of an AT128E2X); tier4/nebula (times, 1 to 180
-m, three scans in each revolution at 200 rpm). The SDK interpolates the corrections in halves of a
-step. Nebula and this module interpolate them linearly.
+m, three scans in each revolution at 200 rpm). This module interpolates the corrections linearly, as
+nebula does.
 """
 
 from __future__ import annotations
@@ -157,10 +156,7 @@ class Mirror(Calibration):
         return data + hashlib.sha256(data).digest()
 
     def interpolate_adjustment(self, table: Table | None, azimuth: Any) -> Any:
-        """Return the degrees to add for each channel at some angles of the mirror.
-
-        Values between two steps are interpolated linearly.
-        """
+        """Return the degrees to add for each channel at some angles of the mirror."""
         if table is None:
             return 0.0
         step = np.floor(azimuth / CORRECTION_STEP_DEG)
@@ -169,10 +165,7 @@ class Mirror(Calibration):
 
 
 def parse_adjustments(data: bytes, resolution: int) -> Table:
-    """Return corrections in degrees, (181, channels).
-
-    The last row repeats the first row.
-    """
+    """Return corrections in degrees, (181, channels)."""
     degrees = np.frombuffer(data, np.int8).reshape(LASERS, 180).T * (resolution / 100)
     return np.concatenate([degrees, degrees[:1]])
 
@@ -199,10 +192,7 @@ TAIL = (
 
 
 def points(f: Fields, channels: Mirror) -> Polar:
-    """Return the points of a packet; the last shot is at the packet's time (nebula).
-
-    The module's docstring describes the azimuth, which is clockwise from the left.
-    """
+    """Return the points of a packet; the last shot is at the packet's time (nebula)."""
     blocks = f.body.blocks
     block = np.arange(BLOCKS)[:, None]
     returns = count_returns(f.return_mode)
@@ -232,10 +222,7 @@ def points(f: Fields, channels: Mirror) -> Polar:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Return the values of simulated packet i, 10 scans a second with single return.
-
-    The simulated time omits the intervals in which the mirror rotates and no packet is sent.
-    """
+    """Return the values of simulated packet i, 10 scans a second with single return."""
     shot = i * BLOCKS + np.arange(BLOCKS)
     azimuth = (
         TABLE.faces[shot // SIMULATED_SHOTS % len(TABLE.faces)]

@@ -118,8 +118,7 @@ def configure(
 ) -> Sensor:
     """Return the sensor with a unit's tables instead of the model's.
 
-    A file given to an earlier `configure` remains in use. If the angles are read from a file,
-    opening the sensor does not request the angles.
+    If the angles are read from a file, opening the sensor does not request the angles.
 
     Args:
         points: a function that returns points, given `Fields` and the unit's `Calibration`.
@@ -147,16 +146,14 @@ def configure(
 def read_columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> list[Table]:
     """Return columns of a correction file by their headings, in the order of channels.
 
-    Each column has the shape (channels,). As in the vendor's reader, the mark EEFF above the
-    headings and the hash below the table are ignored.
+    Each column has the shape (channels,).
 
     Args:
         wanted: the columns to read, each with the nominal values of the model.
 
     Raises:
-        UsageError: if the file cannot be read, if a channel of the model does not have exactly one
-            value in each column, or if `check_spread` rejects a column. The error has the line and
-            column.
+        UsageError: if the file cannot be read, if a column lacks or repeats a channel, or if
+            `check_spread` rejects a column. The error has the line and column.
     """
     (line, headings), *rows = read_rows(path)
     indexes = [find_column(path, line, headings, column) for column in (CHANNEL, *wanted)]
@@ -286,8 +283,7 @@ def check_spread(
 ) -> None:
     """Raise UsageError if the spread of `table` differs greatly from the model's.
 
-    The spread is the difference between the highest and the lowest value. Columns with a nominal
-    spread of at most 1 are not checked.
+    The spread is the difference between the highest and the lowest value.
     """
     spread = float(np.ptp(table))
     nominal_spread = float(np.ptp(nominal_values))

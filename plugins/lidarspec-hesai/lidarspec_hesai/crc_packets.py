@@ -105,8 +105,7 @@ def make_packet(
         blocks: the type of the number of blocks.
         imu: whether the packet can have an IMU part.
         safety: whether the packet can have a functional safety part.
-        verify_crc: whether CRCs are verified. For models whose covered bytes are not known, CRCs
-            are plain fields.
+        verify_crc: whether CRCs are verified, instead of being plain fields.
     """
     crc = Int32ul if verify_crc else Int32ul * UNCHECKED_NOTE
     fine_azimuth = [] if block is None else ["fine_azimuth" / block]
@@ -155,7 +154,6 @@ def max_packet_bytes(blocks: int, block: int) -> int:
     """Return the size of a packet with all parts, in bytes.
 
     Args:
-        blocks: the number of blocks.
         block: the size of a block in bytes.
     """
     return 12 + blocks * block + 4 + 17 + 32 + 4 + 22 + 4 + 32
@@ -183,10 +181,7 @@ ACKNOWLEDGED = {
 
 
 def distance(f: Fields) -> Any:
-    """Return distances in metres, (n, blocks, lasers).
-
-    The header contains the unit of the sent distances.
-    """
+    """Return distances in metres, (n, blocks, lasers)."""
     return f.body.blocks.channels.distance * (f.dis_unit * 0.001)
 
 

@@ -24,8 +24,6 @@ def make_spinning_sensor(
     """Return a rotating sensor; opening it requests the angles of the unit.
 
     Args:
-        id: the id of the sensor.
-        data: its data frames.
         points: a function that returns points, given `Fields` and the unit's `Calibration`.
         table: the nominal corrections of the model.
         sweep: a function that returns the values of simulated packet i.

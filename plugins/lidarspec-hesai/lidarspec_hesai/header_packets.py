@@ -75,10 +75,7 @@ def plausible(f: Fields) -> Any:
 
 
 def distance(f: Fields) -> Any:
-    """Return distances in metres, (n, blocks, lasers).
-
-    The header contains the unit of the sent distances.
-    """
+    """Return distances in metres, (n, blocks, lasers)."""
     return f.blocks.channels.distance * (f.dis_unit * 0.001)
 
 

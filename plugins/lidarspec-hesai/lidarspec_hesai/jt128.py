@@ -2,8 +2,8 @@
 
 Unlike in a Pandar128E3X, the header contains the number of blocks, the motor speed has steps of 0.1
 rpm, and the packet's time is 1.888 ms after the last shot. The usual number of blocks, the range
-limits and the rotation speed are not public. Packets are therefore read with the number of blocks
-in their header, and simulated with 2 blocks at 10 Hz.
+limits and the rotation speed are not public. Simulated packets have 2 blocks, and 10 revolutions a
+second.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc; angle and firing-time files of
 the model).
@@ -74,7 +74,7 @@ FIRING_US = (
 def points(f: Fields, channels: Calibration) -> Polar:
     """Return the points of a packet.
 
-    The last shot is 1.888 ms before the packet's time (HesaiLidar_SDK_2.0).
+    Source: HesaiLidar_SDK_2.0 (the last shot is 1.888 ms before the packet's time).
     """
     block = block_numbers(f)
     returns = count_returns(f.return_mode)

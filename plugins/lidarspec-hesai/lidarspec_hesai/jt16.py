@@ -10,11 +10,10 @@ sample:
 
 No captured packet was available. The azimuths per revolution and the rotation speed are not public.
 The simulation has 600 azimuths per revolution, as in the vendor's code, and makes 5 revolutions a
-second, which is the most that the baud rate allows. The axes of the IMU are not documented, so its
-samples are available as fields only.
+second. The axes of the IMU are not documented, so its samples are available as fields only.
 
 Commands are not supported: they use a second line (RS232, 9600 baud), and contain random numbers.
-The angles of a unit, which a command could read, come from a correction file instead.
+The angles of a unit come from a correction file.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_8.h, udp1_8_parser.cc: fields, steps of 4 mm, angles,
 CRC; serial_source.cc: lengths; parameter_introduction.md: 3,125,000 baud; JT16 correction file).

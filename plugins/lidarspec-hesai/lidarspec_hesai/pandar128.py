@@ -7,10 +7,9 @@ A packet has 861 bytes, 893 with a signature:
     [safety], tail [, sequence] [, IMU], CRC [, signature]
 
 The models differ in the status. The CRCs are probably the same as in packets of a QT128. No
-captured packet was available, so they are not verified. The operational state and the azimuth state
-of the block determine which channels fire and when; each of sixteen groups of eight channels has
-common firing times. Below 2.85 m, 32 channels of a Pandar128E3X fire 0.8 to 16.7 us later than in
-the tables of this module.
+captured packet was available, so the CRCs are not verified. The operational state and the azimuth
+state of the block determine which channels fire and when. Below 2.85 m, 32 channels of a
+Pandar128E3X fire 0.8 to 16.7 us later than in the tables of this module.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc: status of each model, block and
 firing times; angle and firing-time files of sample units); Pandar128E3X user manual (lengths; the
@@ -187,8 +186,7 @@ FRAMES = {
 def points(f: Fields, channels: Calibration, last: float, times: Any) -> Polar:
     """Return the points of a packet.
 
-    The time of the last shot is as in HesaiLidar_SDK_2.0. The delays of the channels depend on the
-    state of the block.
+    Source: HesaiLidar_SDK_2.0 (time of the last shot).
 
     Args:
         last: the time from the packet's time to the last shot, seconds.
@@ -217,9 +215,7 @@ def sweep(i: int, status: int) -> dict[str, Any]:
 
 
 def channel_times(groups: str, times_us: Mapping[str, Sequence[float]]) -> Any:
-    """Return the firing time of each channel in each state, (states, channels).
-
-    The times are in seconds.
+    """Return channels' firing times in each state, in seconds, (states, channels).
 
     Args:
         groups: a letter for each channel, which names its group.
@@ -231,8 +227,7 @@ def channel_times(groups: str, times_us: Mapping[str, Sequence[float]]) -> Any:
 def relatives(own: str) -> dict[str, Relative]:
     """Return, by id, how to recognize the models that send these packets.
 
-    The models are recognized by the status in their packets. `own` is the id of this model, which
-    is left out.
+    `own` is the id of the model to leave out.
     """
     others = {
         "hesai-pandar128": Relative(

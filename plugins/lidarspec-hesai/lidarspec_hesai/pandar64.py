@@ -83,8 +83,7 @@ def plausible(f: Fields) -> Any:
 def points(f: Fields, channels: Calibration) -> Polar:
     """Return the points of a packet.
 
-    The shots are before the packet's time (HesaiLidar_SDK_2.0). With dual return, a pair of blocks
-    is one shot.
+    Source: HesaiLidar_SDK_2.0 (times of the shots).
     """
     block = np.arange(BLOCKS)[:, None]
     returns = count_returns(f.return_mode)

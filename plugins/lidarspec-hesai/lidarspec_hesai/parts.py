@@ -90,8 +90,6 @@ def make_points(
     """Return the points of a packet.
 
     Args:
-        blocks: the blocks of the frame.
-        channels: the corrections of each channel.
         distance: the distances in metres, (n, blocks, channels).
         block: the number of each block, (blocks, 1) or (n, blocks, 1).
         returns: the number of consecutive blocks with the returns of one shot.
@@ -110,10 +108,7 @@ def make_points(
 
 
 def rotation_values(i: int, blocks: int, per_turn: int, rate_hz: float = 10.0) -> dict[str, Any]:
-    """Return azimuths, speed and time of packet i of a simulated rotating sensor.
-
-    The sensor fires `per_turn` blocks per revolution.
-    """
+    """Return azimuths, speed and time of packet i of a simulated rotating sensor."""
     shots = i * blocks + np.arange(blocks)
     now = EPOCH + datetime.timedelta(
         microseconds=round(1e6 * (i + 1) * blocks / (per_turn * rate_hz))

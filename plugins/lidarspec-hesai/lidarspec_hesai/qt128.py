@@ -118,8 +118,7 @@ TAIL = (
 def points(f: Fields, channels: Calibration) -> Polar:
     """Return the points of a packet.
 
-    The shots are after the packet's time (HesaiLidar_SDK_2.0). Firing times depend on the loop,
-    which changes with each shot.
+    Source: HesaiLidar_SDK_2.0 (times of the shots).
     """
     block = np.arange(BLOCKS)[:, None]
     returns = count_returns(f.return_mode)

@@ -72,8 +72,7 @@ TAIL = (
 def points(f: Fields, channels: Calibration) -> Polar:
     """Return the points of a packet.
 
-    The shots are after the packet's time (HesaiLidar_SDK_2.0). A packet has four shots, or two with
-    dual return.
+    Source: HesaiLidar_SDK_2.0 (times of the shots).
     """
     block = block_numbers(f)
     returns = count_returns(f.return_mode)

@@ -52,8 +52,7 @@ TAIL = (
 def points(f: Fields, channels: Calibration) -> Polar:
     """Return the points of a packet.
 
-    The last shot is at the packet's time (HesaiLidar_SDK_2.0). The number of returns is determined
-    from the return mode, because the header contains the maximum number.
+    Source: HesaiLidar_SDK_2.0 (times of the shots).
     """
     block = block_numbers(f)
     returns = count_returns(f.return_mode)

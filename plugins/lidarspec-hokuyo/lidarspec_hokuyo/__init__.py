@@ -1,11 +1,9 @@
 """Hokuyo scanners with SCIP 2.0: URG-04LX, UST-10LX, UST-20LX, UTM-30LX and UTM-30LX-EW.
 
-The reply to a scan command contains the measurements of one revolution and the range of requested
-steps. It contains neither the number of steps of a full revolution nor the model. MD requests
-continuous scans with distances, ME with distances and intensities, MS with distances of two
-characters, and ND and NE with all echoes. GD, GE, GS, HD and HE request one scan; the laser has to
-be switched on with `laser_on` before. Scans with any range of steps are decoded.
-``configure(content=, first=, last=, cluster=)`` selects the steps that are requested.
+MD requests continuous scans with distances, ME with distances and intensities, MS with distances of
+two characters, and ND and NE with all echoes. GD, GE, GS, HD and HE request one scan, and require
+that the laser was switched on with `laser_on`. Scans with any range of steps are decoded.
+``configure(content=, first=, last=, cluster=)`` selects the scans that are requested.
 
 Source: SCIP 2.0, C-42-03320B (table 2: steps; 8: commands, and the reply of a URG-04LX to PP);
 UST-10LX/20LX, C-42-04076 (port); replies of a UST-10LX and a UTM-30LX-EW to PP, published by users,

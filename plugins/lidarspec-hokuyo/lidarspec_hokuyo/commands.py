@@ -1,8 +1,7 @@
 """Commands and their replies.
 
 A reply consists of an echo of the command, a status and optional lines, each with a name and a
-value. In the lines of VV, PP and II, the check character covers the text before the semicolon.
-Commands end with a line feed. They are sent without the optional text that a scanner would repeat.
+value. Commands end with a line feed.
 
 Source: SCIP 2.0, C-42-03320B, section 8 (BM, QT, RS, TM, SS, CR, HS, VV, PP, II).
 """
@@ -95,7 +94,7 @@ def make_line(name: str, letters: str) -> Construct:
 
 
 def make_reply(command: bytes, lines: Mapping[str, str]) -> Frame:
-    """Return the frame of a reply with these lines.
+    """Return the frame of a reply with lines of text.
 
     `lines` maps the field name of each line to the four letters with which the line begins.
     """

@@ -131,10 +131,7 @@ def plausible(f: Fields, end: int) -> Any:
 
 
 def points(f: Fields, geometry: Geometry, echoes: int) -> Polar:
-    """Return the points of a scan, counter-clockwise from the first step.
-
-    A value below the shortest distance is an error code or a missing echo, so its point is invalid.
-    """
+    """Return the points of a scan, counter-clockwise from the first step."""
     step = decimal_value(f.first) + f.points.index * cluster_size(f) + (cluster_size(f) - 1) / 2
     returns = f.points if echoes == 1 else f.points.echoes
     return Polar(
@@ -190,7 +187,7 @@ def make_scan_frame(command: str, geometry: Geometry) -> Frame:
 def pace(f: Fields, rate: float) -> Any:
     """Return the seconds from a scan to the next; nan for single scans.
 
-    A command may request that revolutions between scans are left out (SCIP 2.0, 8.1).
+    Source: SCIP 2.0, 8.1.
 
     Args:
         rate: revolutions per second.

@@ -116,7 +116,6 @@ def plausible(f: Fields) -> Any:
 def parallax_angle(distance: Any) -> Any:
     """Return the degrees to subtract from the clockwise angle of an LD14's points.
 
-    The receiver of an LD14 is beside the axis of rotation, so the angle depends on the distance.
     `distance` is in metres. Source: SDK, sl_transform.cpp.
     """
     mm = distance * 1000
@@ -129,7 +128,6 @@ def points(f: Fields, rate: int, *, correct_parallax: bool = False) -> Polar:
     Source: manual 3.2.
 
     Args:
-        f: the fields of n frames.
         rate: points per second.
         correct_parallax: whether to subtract `parallax_angle`, for a model that measures by
             triangulation.
@@ -149,7 +147,6 @@ def sweep(i: int, rate: int, turns: int) -> dict[str, float]:
     """Return the simulated values of frame i.
 
     Args:
-        i: the number of the frame.
         rate: points per second.
         turns: revolutions per second.
     """
@@ -236,7 +233,6 @@ def make_lidar(
         turns: simulated revolutions per second.
         correct_parallax: whether to correct the angles for the parallax.
         older_rate: points per second of older units.
-        frames: the frame types in addition to `data`.
         more: further arguments of `Sensor`.
     """
     rate = POINT_RATES_HZ[name]

@@ -50,10 +50,7 @@ def make_returns(count: int, *members: Any) -> Any:
 def cartesian(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) -> Cartesian:
     """Return points from the sent x, y and z, which are in REP-103 axes.
 
-    If a point has no return, its x, y and z are 0.
-
     Args:
-        f: the fields of n packets.
         time: the time of each shot, in seconds after the packet's clock.
         returns: returns per shot.
         tagged: whether points have a tag.
@@ -93,9 +90,6 @@ def imu(f: Fields) -> Imu:
 
 def simulated_angles(shots: Any, rate: float, view: View) -> tuple[Any, Any]:
     """Return azimuth and elevation in degrees of simulated shots.
-
-    The real pattern never repeats and is not published. The simulated pattern is a wave that moves
-    up and down 610 times a second, and across 7.3 times a second.
 
     Args:
         shots: the numbers of the shots since the start.

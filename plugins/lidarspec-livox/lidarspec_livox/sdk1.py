@@ -149,10 +149,7 @@ def make_packet(kind: int, *members: Any) -> Struct:
 
 
 def clock(f: Fields) -> tuple[Any, ...]:
-    """Return four exact terms whose sum is the time in seconds.
-
-    A packet contains the time as a date or as nanoseconds.
-    """
+    """Return four exact terms whose sum is the time in seconds."""
     low = f.timestamp.low
     middle = f.timestamp.middle
     high = f.timestamp.high
@@ -168,10 +165,7 @@ def clock(f: Fields) -> tuple[Any, ...]:
 
 
 def has_known_header(f: Fields) -> Any:
-    """Return whether timestamp type, slot and Lidar number are in their ranges.
-
-    Slot and number identify a Lidar on a hub. A Lidar without a hub sends them as well.
-    """
+    """Return whether timestamp type, slot and Lidar number are in their ranges."""
     return (f.timestamp_type <= 4) & (f.timestamp_type != 2) & (f.slot <= 15) & (f.lidar_id <= 15)
 
 
@@ -202,7 +196,6 @@ def make_data_frame(name: str, rate: float, **more: Any) -> Frame:
     Args:
         name: a key of `DATA_TYPES`.
         rate: shots per second.
-        more: further arguments of `Frame`.
     """
     kind, shots, returns, members = DATA_TYPES[name]
     is_spherical = name.endswith("spherical")
@@ -236,7 +229,6 @@ def make_simulation(name: str, rate: float, view: View, **more: Any) -> Simulati
         name: a key of `DATA_TYPES`.
         rate: shots per second.
         view: the field of view.
-        more: further arguments of `Simulation`.
     """
     _, count, returns, _ = DATA_TYPES[name]
     shots = np.arange(count)[:, None] if returns > 1 else np.arange(count)

@@ -2,8 +2,8 @@
 
 Points, IMU samples and parameters are sent over UDP, each from and to its own port. After `start`,
 a Lidar sends points to the host that was set with `set_point_host`. It sends its parameters once a
-second without a request. Some firmware of the Mid-360 is reported to send point packets with a CRC
-of 0. Such packets are accepted without a check.
+second without a request. Point packets with a CRC of 0 are accepted without a check, because some
+firmware of the Mid-360 is reported to send them.
 
 Source: Livox Mid-360 protocol document 1.4.10 and Livox-SDK2 08f523c (livox_lidar_def.h); for
 differences of the HAP, HAP protocol document 1.4.8. The point rate, range limits and field of view
@@ -140,9 +140,7 @@ def make_points_frame(kind: int, points: Any, *members: Any, **more: Any) -> Fra
 
     Args:
         kind: the data type.
-        points: the points function.
         members: the fields of a shot.
-        more: further arguments of `Frame`.
     """
     struct = make_packet(kind, "points" / Array(this.dot_num, Struct(*members)))
     return Frame(
@@ -158,11 +156,8 @@ def make_points_frame(kind: int, points: Any, *members: Any, **more: Any) -> Fra
 def make_message(cmd_id: int | None, *members: Any, ack: bool = True, lidar: bool = True) -> Any:
     """Return the struct of a control frame: header with CRC-16, data with CRC-32.
 
-    In a frame without data, the CRC-32 is 0.
-
     Args:
         cmd_id: the command; None for frames of several commands.
-        members: the data.
         ack: whether the message is a reply.
         lidar: whether the Lidar sends the message.
     """
@@ -304,7 +299,6 @@ def make_simulation(rate: float, view: View, shots: Any = SHOTS, **more: Any) ->
         rate: the number of shots per second.
         view: the field of view.
         shots: the numbers of the shots in a packet.
-        more: further arguments of `Simulation`.
     """
     points = len(shots)
 
@@ -469,11 +463,9 @@ def make_setter(
     """Return a command that sets one parameter.
 
     Args:
-        frame: the frame of the request.
         name: a key of `PARAMETERS`.
         values: the fixed values, by the name of a field in the parameter.
         args: for each argument, the name of a field in the parameter and the range.
-        more: further arguments of `Command`.
     """
     all_values = {
         "parameter.key": PARAMETERS[name][0],
@@ -651,10 +643,7 @@ def make_lidar(name: str) -> Sensor:
 
 
 def is_fast(f: Fields) -> Any:
-    """Return whether the time between points is about 2.2 us, as in packets of a HAP.
-
-    A HAP measures 452,000 points a second, and a Mid-360 200,000.
-    """
+    """Return whether the time between points is about 2.2 us, as in packets of a HAP."""
     return f.time_interval < 3.3e-6 * f.dot_num
 
 

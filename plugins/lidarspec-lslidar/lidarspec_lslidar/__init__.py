@@ -126,10 +126,7 @@ def mask_no_return(distance: Any) -> Any:
 
 
 def sample_directions(f: Fields) -> tuple[Any, Any]:
-    """Return the azimuths and times of the samples of the N family.
-
-    Azimuths are in radians, and times are in seconds after the first sample.
-    """
+    """Return the azimuths of the samples in radians, and their times in seconds."""
     clockwise = spread(f.start_angle, f.end_angle, N_SAMPLES, full=360.0)  # degrees, (n, 16)
     return -np.deg2rad(wrap(clockwise, 360.0)), (clockwise - f.start_angle) / SPAN_DEG * f.period
 
@@ -158,11 +155,7 @@ def n10p_points(f: Fields) -> Polar:
 
 
 def m_points(f: Fields, count: Callable[[Fields], Any]) -> Polar:
-    """Return points at even steps over 15 degrees from the start angle on.
-
-    Points with a strong reflection have the intensity 255, as in the driver. `count` is a function
-    that returns the number of samples of a packet.
-    """
+    """Return points at even steps over 15 degrees from the start angle on."""
     samples = count(f)
     clockwise = spread(
         f.start_angle, f.start_angle + SPAN_DEG - SPAN_DEG / samples, samples, full=360.0
@@ -178,10 +171,7 @@ def m_points(f: Fields, count: Callable[[Fields], Any]) -> Polar:
 
 
 def n_sweep(i: int, packets: int) -> dict[str, float]:
-    """Return the values of simulated packet i at 10 Hz.
-
-    `packets` is the number of packets per revolution.
-    """
+    """Return the values of simulated packet i at 10 Hz."""
     step = 360 / packets / N_SAMPLES
     first = i % packets * N_SAMPLES * step
     return {
@@ -195,7 +185,6 @@ def m_sweep(i: int, hertz: float, count: int = 0, *, timed: bool = False) -> dic
     """Return the values of simulated packet i; a revolution has 24 packets.
 
     Args:
-        i: the number of the packet.
         hertz: revolutions per second.
         count: the number of samples, if packets contain their length; otherwise 0.
         timed: whether packets have a time.
@@ -315,11 +304,7 @@ class Model:
     """One row of the table of models.
 
     Attributes:
-        name: the name of the model.
         data: the frame of its packets.
-        points: its `points` function.
-        sweep: the function that returns simulated values.
-        baud: the baud rate.
         hertz: the lowest and the highest number of revolutions per second.
         clock: the clock in the packets; None if they have no time.
         status: how the model was verified, as in `Sensor`.
@@ -365,11 +350,8 @@ MODELS = {
 
 
 def make_lidar(name: str) -> Sensor:
-    """Return the sensor of one row of `MODELS`.
-
-    The lidars rotate as soon as they have power. They are not stopped when the device is closed,
-    because drivers expect them to rotate.
-    """
+    """Return the sensor of one row of `MODELS`."""
+    # the lidars are not stopped when the device is closed, because drivers expect them to rotate
     model = MODELS[name]
     family = name.startswith("lslidar-n")
     return Sensor(

@@ -9,10 +9,8 @@ us, as in the previous edition. This agrees with the steps of 0.36 degrees in a 
 20 revolutions a second. The last firing of a packet is at the time of the packet, as in the driver.
 
 The clock is read as a date and nanoseconds, which the sensor sends if it is synchronized by GPS.
-With PTP, the same bytes are seconds, and with NTP, the last bytes are microseconds. Only the device
-information contains the source of the time. Two features are not supported: configuration, for
-which the whole device information has to be sent to the sensor, and angles that a unit has measured
-itself.
+The times of PTP and NTP are sent in other units and are not supported. The configuration of the
+sensor and the measured angles of a unit are not supported either.
 """
 
 from __future__ import annotations
@@ -124,11 +122,7 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields, unit: float = DISTANCE_STEPS_CM[0]) -> Polar:
-    """Return the points; azimuths are interpolated between blocks.
-
-    Azimuths are clockwise from straight ahead. The optical centre is at a distance from the axis,
-    and rotates with the lasers. `unit` is the distance step in centimetres.
-    """
+    """Return the points; azimuths are interpolated between blocks."""
     dual = f.return_mode == DUAL
     block = np.arange(BLOCKS)[:, None, None]
     slot = np.arange(GROUPS)[:, None] * LASERS + np.arange(LASERS)
@@ -153,10 +147,7 @@ def points(f: Fields, unit: float = DISTANCE_STEPS_CM[0]) -> Polar:
 
 
 def pace(f: Fields) -> Any:
-    """Return the duration of the blocks of a packet in seconds.
-
-    With dual return, two blocks are one firing.
-    """
+    """Return the duration of the blocks of a packet in seconds."""
     return np.where(f.return_mode == DUAL, BLOCKS // 2, BLOCKS) * BLOCK_PERIOD_S
 
 
@@ -169,8 +160,6 @@ def block_step(f: Fields, dual: Any) -> Any:
 
 def configure(sensor: Sensor, /, *, distance_unit: float) -> Sensor:
     """Return the sensor with distance steps of 0.4 or, for some units, 0.25 cm.
-
-    The driver has a parameter of the same name.
 
     Raises:
         UsageError: for another step.

@@ -1,15 +1,15 @@
 """Neato XV-11, and related lidars of vacuum cleaners and of the TurtleBot3.
 
-They measure one point per degree. Source: the drivers xv_11_laser_driver, kaiaai/LDS
+The lidars measure one point per degree. Source: the drivers xv_11_laser_driver, kaiaai/LDS
 (LDS_NEATO_XV11, LDS_LDS02RR, LDS_HLS_LFCD2) and hls_lfcd_lds_driver of ROBOTIS; there are no public
 manuals. The XV-11 and Xiaomi's LDS01RR count angles counter-clockwise, and the LDS02RR counts them
-clockwise; the packets do not contain the direction. The host drives their motors with PWM, at 5
-revolutions a second; they send nothing while the motor is off.
+clockwise; the packets do not contain the direction. The host drives the motors with PWM, at 5
+revolutions a second. The lidars send nothing while the motor is off.
 
 The sources disagree about the HLS-LFCD2. Its speed is in tenths of a revolution per minute
 (ROBOTIS, thijses/HLS_LFCD) or in whole revolutions per minute (kaiaai). Its last two bytes are both
-FF minus the sum of the other bytes (thijses), or the folded sum of an XV-11 (kaiaai). ROBOTIS
-ignores these bytes. This module ignores them as well, and requires two consecutive packets instead.
+FF minus the sum of the other bytes (thijses), or the folded sum of an XV-11 (kaiaai). This module
+ignores these bytes, as ROBOTIS does, and requires two consecutive packets instead.
 """
 
 from __future__ import annotations
@@ -110,10 +110,7 @@ def is_lfcd_plausible(f: Fields) -> Any:
 
 
 def sample_times(f: Fields, count: int) -> Any:
-    """Return the seconds from the first sample of a packet to each sample.
-
-    Samples are one degree apart. The result is 0 if the motor does not rotate.
-    """
+    """Return the seconds from the first sample of a packet to each sample."""
     return np.where(f.speed > 0, np.arange(count) / (np.maximum(f.speed, 1 / 64) * 6), 0)
 
 
@@ -151,13 +148,10 @@ XV11_DIRECTIONS = {"neato-xv11": 1, "xiaomi-lds01rr": 1, "xiaomi-lds02rr": -1}
 
 
 def describe_differences(own: str) -> dict[str, str]:
-    """Return how each other model with packets of an XV-11 differs from this one.
+    """Return, by id, how each other model with packets of an XV-11 differs.
 
     Args:
         own: the id of this model.
-
-    Returns:
-        A text for each other model, by its id.
     """
     texts = {}
     for other, direction in XV11_DIRECTIONS.items():

@@ -1,6 +1,7 @@
 """ORADAR MS200: 360 degree time-of-flight lidar, which streams over a UART at 230 400 baud.
 
-The data frame is the same as that of LDROBOT's LD06. Commands and start messages are different.
+The data frame is the same as that of LDROBOT's LD06. The commands and the start messages differ
+from those of an LD06.
 
 Source: the vendor's SDK as published with oradar_lidar (ordlidar_protocol.h, ord_lidar_driver.cpp,
 utils.h) and its ROS node (oradar_scan_node.cpp, ms200_scan.launch.py). The SDK does not state when
@@ -94,10 +95,7 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields) -> Polar:
-    """Return points at even steps from the start angle to the end angle.
-
-    Angles increase clockwise, as the vendor's node assumes by default.
-    """
+    """Return points at even steps from the start angle to the end angle."""
     clockwise = spread(f.start_angle, f.end_angle, POINTS, full=360.0)  # degrees, (n, 12)
     step = wrap(f.end_angle - f.start_angle, 360.0) / (POINTS - 1)
     return Polar(

@@ -2,9 +2,8 @@
 
 The layout of packets and the directions of beams are read from the metadata of the unit. The
 metadata are in a file (`configure(metadata=path)`), or are requested from the sensor's web server
-when the sensor is opened. Without metadata, the user can pass a layout (`rows`, `turn`, `profile`).
-The angles are then those of an ideal sensor, evenly spread over the field of view, and are marked
-as nominal.
+when the sensor is opened. Without metadata, the user can pass a layout (`rows`, `turn`, `profile`),
+and the angles are the nominal angles of an ideal sensor.
 
 Source: Software User Manual of firmware 2.x and 3.x (coordinates, HTTP API); ouster-sdk
 (parsing.cpp, xyzlut.cpp, sensor_http_imp.cpp). The fields of view, and the offsets of OS0, OS1 and
@@ -68,10 +67,7 @@ METADATA_ONLY = "both models send the same packets; the metadata name the model"
 
 
 def points(f: Fields, unit: Unit) -> Polar:
-    """Return the points of the pixels, calculated with the beams of the unit.
-
-    The two returns of a pixel are adjacent points.
-    """
+    """Return the points of the pixels, calculated with the beams of the unit."""
     columns = f.columns
     bits = PROFILES[unit.profile]
     names = dict.fromkeys(name for name in bits if name[0] != "_" and name[-1] != "2")
@@ -114,17 +110,14 @@ def points(f: Fields, unit: Unit) -> Polar:
 def pace(f: Fields, columns: int) -> Any:
     """Return the seconds from a packet to the next, from the times of its columns.
 
-    Each column has a timestamp in nanoseconds (Software User Manual, lidar data packet format).
+    Source: Software User Manual, lidar data packet format (timestamps in nanoseconds).
     """
     span = f.columns[columns - 1].timestamp - f.columns[0].timestamp
     return span * 1e-9 * columns / (columns - 1)
 
 
 def sweep(unit: Unit, i: int) -> dict[str, Any]:
-    """Return the values of simulated packet i.
-
-    The unit makes ten revolutions a second if its metadata give no rate.
-    """
+    """Return the values of simulated packet i."""
     numbers = unit.columns * i + np.arange(unit.columns)
     turn_numbers = numbers % unit.turn
     times = numbers * (1_000_000_000 // (unit.turn * int(unit.rate or 10)))

@@ -179,9 +179,7 @@ def read_unit(metadata: str | Path | Learned) -> Unit:
 def merge_sections(data: dict[str, Any]) -> dict[str, Any]:
     """Return the keys of all sections in one mapping.
 
-    The section of a key depends on the firmware: `imu_measurements_per_packet` is in
-    `lidar_data_format` or in `imu_data_format`. Values reported by the sensor take precedence over
-    `config_params`, the user's settings.
+    Values reported by the sensor take precedence over `config_params`, the user's settings.
     """
     sections = [
         section
@@ -286,7 +284,6 @@ class MetadataKeys:
         """Return the finite numbers of a key.
 
         Args:
-            key: the key.
             count: the required number of numbers; None for any number.
             default: the numbers if the key is missing; None if the key is required.
         """
@@ -317,10 +314,7 @@ class MetadataKeys:
         return number
 
     def _read_transform(self, key: str, default: tuple[float, ...] | None) -> Any:
-        """Return a matrix (4, 4) from 16 numbers in one list or in four lists.
-
-        Returns None if both the key and the default are missing.
-        """
+        """Return a matrix (4, 4) from 16 numbers in one list or in four lists."""
         if default is None and key not in self.data:
             return None
         value = self.data.get(key, default)

@@ -165,11 +165,7 @@ def make_pixel(profile: str) -> Construct:
 
 
 def make_field(name: str, bits: int) -> Construct:
-    """Return the type of a pixel's field.
-
-    Ranges of 15 bits have steps of 8 mm, and all other ranges have steps of 1 mm. A near-infrared
-    value of 8 bits lacks its low 4 bits.
-    """
+    """Return the type of a pixel's field."""
     if name.startswith("range"):
         return Scaled(BitsInteger(bits), 0.008 if bits == 15 else 0.001, "m")
     if (name, bits) == ("near_ir", 8):
@@ -231,11 +227,7 @@ def is_plausible(f: Fields, turn: int) -> Any:
 
 
 def is_legacy_plausible(f: Fields, turn: int) -> Any:
-    """Return whether columns, status, encoder and frame id of a LEGACY packet are valid.
-
-    LEGACY packets contain no packet type, so more rules are needed to distinguish them from other
-    data.
-    """
+    """Return whether columns, status, encoder and frame id of a LEGACY packet are valid."""
     columns = f.columns
     has_known_status = (columns.status == VALID) | (columns.status == 0)
     return (

@@ -2,9 +2,8 @@
 
 Packets do not declare their layout. Several layouts have the same packet length, for example 32
 pixels of 16 bytes, 64 pixels of 8 bytes and 128 pixels of 4 bytes. If the tried layout has too many
-pixels, every second or fourth range is actually another field. The mean ranges of four adjacent
-rows then differ. Among layouts with the same number of pixels, the first one in `PROFILES` whose
-unused bits are 0 in most pixels is used. Some layouts cannot be distinguished.
+pixels, some of the ranges are read from another field, so the mean ranges of adjacent rows differ.
+Some layouts cannot be distinguished.
 
 In LEGACY, the number of columns per revolution is determined from the encoder. In other profiles,
 it is estimated from the largest column number and the time between columns. The estimate assumes
@@ -32,10 +31,7 @@ Bytes2D = NDArray[np.uint8]
 
 
 def recognise(datagrams: Sequence[bytes]) -> dict[str, Any]:
-    """Return the options of `configure` with which most of the datagrams are valid.
-
-    Returns {} if the datagrams are not lidar packets.
-    """
+    """Return the options of `configure` with which most of the datagrams are valid."""
     lengths = [len(data) for data in datagrams]
     layouts = {
         (profile, rows): packet_bytes(profile, rows) for profile in PROFILES for rows in ROW_COUNTS
@@ -120,8 +116,8 @@ def split_columns(packets: Bytes2D, profile: str) -> Bytes2D | None:
 def row_similarity(columns: Bytes2D, profile: str, rows: int) -> float:
     """Return how similar the mean ranges of four groups of rows are, from 0 to 1.
 
-    Each group has every fourth row. The result is the smallest mean range divided by the largest
-    mean range; -1 if unused bits are set in many pixels.
+    The result is the smallest mean range divided by the largest mean range; -1 if unused bits are
+    set in many pixels.
     """
     start = 16 if profile == "LEGACY" else 12
     bits = PROFILES[profile]

@@ -4,11 +4,11 @@ A program requests a handle from the scanner over HTTP, and starts the output wi
 UDP, the request names the receiver of the data. With TCP, the reply contains the port of the data.
 Without ``feed_watchdog``, the output ends after a minute.
 
-Source: R2000 Ethernet communication protocol, version 1.04, chapters 1 and 3, as far as the
-vendor's drivers repeat them: pf_lidar_ros_driver (PFHeader.msg, PFR2000Header.msg,
-pf_r2000_packet_a, _b and _c.cpp, pfsdp_base.cpp, PFDriverR2000.cfg, the tables of its topics for
-`status_flags`) and the older pepperl_fuchs_r2000 (packet_structure.h). The range is assumed to be
-that of an OMD30M. An R2300 has packets of another type.
+Source: R2000 Ethernet communication protocol, version 1.04, chapters 1 and 3, as repeated in the
+vendor's drivers: pf_lidar_ros_driver (PFHeader.msg, PFR2000Header.msg, pf_r2000_packet_a, _b and
+_c.cpp, pfsdp_base.cpp, PFDriverR2000.cfg, the tables of its topics for `status_flags`) and the
+older pepperl_fuchs_r2000 (packet_structure.h). The range is assumed to be that of an OMD30M. An
+R2300 has packets of another type.
 """
 
 from __future__ import annotations
@@ -174,11 +174,7 @@ def sample_interval(f: Fields) -> Any:
 
 
 def pace(f: Fields) -> Any:
-    """Return the seconds since the previous packet.
-
-    The previous packet may be in the previous revolution. All packets of a scan except the last
-    have the same number of samples.
-    """
+    """Return the seconds since the previous packet."""
     interval = sample_interval(f)
     samples_before = f.first_index / np.maximum(f.packet_number - 1, 1)
     last_samples = (f.num_points_scan - 1) % np.maximum(f.num_points_packet, 1) + 1
@@ -350,8 +346,7 @@ def configure(
 ) -> Sensor:
     """Return the sensor for packets of this type over UDP or TCP.
 
-    Packets of type A have distances. Packets of types B and C have distances and amplitudes; a
-    sample has 6 bytes in B and 4 bytes in C.
+    Packets of type A have distances. Packets of types B and C have distances and amplitudes.
     """
     first = f"packet_{packet.lower()}"
     frames = {first: sensor.frames[first], **sensor.frames}

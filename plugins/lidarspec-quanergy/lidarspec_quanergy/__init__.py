@@ -120,9 +120,6 @@ def plausible(f: Fields) -> Any:
 def three_return_points(f: Fields, elevation: NDArray[np.float64]) -> Polar:
     """Return the points of packets with three returns of each laser.
 
-    If a laser has fewer returns, the third distance repeats the first or the second. The repeated
-    distance is then kept once, as the third return.
-
     `elevation` is in radians, one per laser.
     """
     firings = f.firings

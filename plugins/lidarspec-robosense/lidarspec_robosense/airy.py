@@ -82,10 +82,9 @@ GRAVITY = 9.80665
 
 
 def make_firing_times(*times: float) -> Any:
-    """Return how long after a block's azimuth each laser fires, (blocks, lasers).
+    """Return the firing time of each laser in seconds, (blocks, lasers).
 
-    The result is in seconds. `times` has the firing time of each group of eight lasers in a pair of
-    blocks, in microseconds.
+    `times` has the firing time of each group of eight lasers in a pair of blocks, in microseconds.
     """
     return np.tile(np.repeat(times, 8).reshape(2, HALF_LASERS), (BLOCKS // 2, 1)) * 1e-6
 
@@ -243,7 +242,7 @@ def points(f: Fields) -> Polar:
 def imu(f: Fields) -> Imu:
     """Return the IMU sample.
 
-    A raw step is 1/32768 of the measuring range, which the sample contains (Table 13).
+    Source: Table 13.
     """
     acceleration_step = take(GRAVITY * np.array([2, 4, 8, 16]) / 32768, f.acceleration_range)
     rotation_step = take(np.deg2rad(np.array([250, 500, 1000, 2000]) / 32768), f.rotation_range)

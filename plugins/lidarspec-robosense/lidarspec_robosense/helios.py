@@ -18,9 +18,7 @@ step further, and blocks are about 100 us apart, which requires 55.56 us. The fi
 lasers are from rs_driver, 1.73 us apart; nebula has other times, up to 48 us.
 
 The published capture with the name of the 16P is of a Helios-5515: its packets have type 6, and its
-DIFOP has 32 different angles with single return. The capture was published with a decoding as a
-16P. In this decoding, the points in the second half of each block have the directions of wrong
-lasers, and the times in a packet extend over twice its duration.
+DIFOP has 32 different angles with single return.
 """
 
 from __future__ import annotations
@@ -198,11 +196,7 @@ def has_block_pairs(f: Fields) -> Any:
 
 
 def has_equal_halves(f: Fields) -> Any:
-    """Return whether the halves of most blocks are equal.
-
-    Such blocks contain two returns of 16 lasers. Both returns are equal for a beam with a single
-    echo.
-    """
+    """Return whether the halves of most blocks are equal."""
     distance = np.asarray(f.blocks.channels.distance)
     first = distance[..., :16]
     second = distance[..., 16:]

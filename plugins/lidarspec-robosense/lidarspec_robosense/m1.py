@@ -177,8 +177,7 @@ def plausible(f: Fields) -> Any:
 def count_returns(f: Fields) -> Any:
     """Return the number of consecutive packets with the returns of the same firings.
 
-    With dual return, an odd packet has the first returns and the next packet has the second returns
-    (M1 user guide, 2.1.2).
+    Source: M1 user guide, 2.1.2.
     """
     return np.where(f.wave_mode == WAVE_MODES["dual"], 2, 1)
 
@@ -189,10 +188,7 @@ def packets_per_frame(f: Fields) -> Any:
 
 
 def number_firings(f: Fields, blocks: int) -> Any:
-    """Return the number of each block's firing, counted from the start of the frame.
-
-    With dual return, both packets of a pair have the same numbers.
-    """
+    """Return the number of each block's firing, counted from the start of the frame."""
     group = np.floor((f.pkt_psn - 1) / count_returns(f))
     return group * blocks + f.blocks.index
 
@@ -204,9 +200,6 @@ def pace(f: Fields) -> Any:
 
 def points(f: Fields) -> Polar:
     """Return the sent ranges and directions, which have REP-103 axes.
-
-    The column of a point is the number of its firing in the frame. The two returns of a firing have
-    the same column and ring.
 
     Source: M1P user guide, page 13.
     """
@@ -227,8 +220,7 @@ def points(f: Fields) -> Polar:
 def simulated_angles(number: int) -> tuple[Any, Any]:
     """Return elevation and azimuth in degrees, (25, 5), of a simulated packet.
 
-    Each of the five channels scans 24 degrees back and forth, in lines from +12.5 to -12.5 degrees
-    of elevation. `number` is the number of the packet in its frame, from 0, with single return.
+    `number` is the number of the packet in its frame, from 0, with single return.
 
     Source: the field of view, the number of packets and the directions of the channels are from the
     guide; the lines are assumed.
@@ -242,8 +234,6 @@ def simulated_angles(number: int) -> tuple[Any, Any]:
 
 def sweep(i: int, temperature: int = 105, *, is_dual: bool = False) -> dict[str, Any]:
     """Return the values of simulated packet i.
-
-    With dual return, both packets of a pair measure the same surface.
 
     Args:
         temperature: the raw byte, or degC if the firmware is known.
@@ -277,10 +267,7 @@ def sweep(i: int, temperature: int = 105, *, is_dual: bool = False) -> dict[str,
 
 
 def sweep_difop(i: int, *, is_dual: bool = False) -> dict[str, Any]:
-    """Return the values of simulated device information, with factory settings.
-
-    `is_dual` selects dual return.
-    """
+    """Return the values of simulated device information, with factory settings."""
     addresses = {"lidar_ip": bytes([192, 168, 1, 200]), "host_ip": bytes([192, 168, 1, 102])}
     modes = {
         "return_mode": WAVE_MODES["dual" if is_dual else "strongest"],
@@ -340,8 +327,7 @@ def configure(
     Args:
         firmware: the formula of the temperature: "current" if the sent byte is degC + 80 (M1P user
             guide, rs_driver), "2021" if it is signed degC (rs_driver of April 2021).
-        simulated_returns: the returns that the simulated sensor sends. Real packets contain their
-            mode.
+        simulated_returns: the returns that the simulated sensor sends.
     """
     if firmware is not None:
         sensor = select_firmware(sensor, firmware)

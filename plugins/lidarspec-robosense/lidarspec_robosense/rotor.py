@@ -127,11 +127,9 @@ SOURCES = ("internal clock", "PPS", "PTP", "gPTP")
 def make_clock_status(sources: Sequence[str] = SOURCES) -> ClockStatus:
     """Return how the state of the clock is read from DIFOP.
 
-    `sources` has the name of the time source for each mode of synchronization; "" for a mode that
-    does not exist.
+    `sources` has the name of the time source for each mode of synchronization.
 
-    Source: RS-LiDAR-M1 and RS-Helios user guides, time synchronization in DIFOP. PPS comes with a
-    GPRMC sentence, whose time is UTC.
+    Source: RS-LiDAR-M1 and RS-Helios user guides, time synchronization in DIFOP.
     """
     internal, *others = sources
     states = {status: ClockState(internal, False, epoch="boot") for status in SYNC_STATES.values()}
@@ -266,7 +264,7 @@ def laser_degrees(entry: Any) -> Any:
     """Return the angle of each channel's laser in degrees.
 
     `entry` is an array of signs and magnitudes in DIFOP. The angles are nan if the sensor is not
-    calibrated, so that points are invalid.
+    calibrated.
     """
     sign = entry.sign.on("channels")
     value = entry.value.on("channels")
@@ -284,8 +282,7 @@ def laser_angles(f: Fields) -> tuple[Any, Any]:
 def points_of_firings(f: Fields, dual: Any, model: Rotor, *, late: Any = 0) -> Polar:
     """Return the points of blocks with one firing of all lasers.
 
-    With dual return, a firing has two blocks. `late` is 1 if the first block of the packet is the
-    second block of a firing, else 0.
+    `late` is 1 if the first block of the packet is the second block of a firing, else 0.
     """
     azimuth = f.blocks.azimuth
     block = f.blocks.index
@@ -297,10 +294,7 @@ def points_of_firings(f: Fields, dual: Any, model: Rotor, *, late: Any = 0) -> P
 
 
 def points_of_groups(f: Fields, dual: Any, model: Rotor, lasers: tuple[Any, Any]) -> Polar:
-    """Return the points of blocks with two groups of all lasers.
-
-    The groups are two firings, or with dual return the two returns of one firing.
-    """
+    """Return the points of blocks with two groups of all lasers."""
     group = np.arange(2)[:, None]
     duration = np.where(dual, 1, 2) * model.period
     elapsed = np.where(dual, 0, group) * model.period + model.delay
@@ -328,9 +322,7 @@ def make_points(
 ) -> Polar:
     """Return the points of lasers with an optical centre away from the axis.
 
-    The optical centre rotates with the rotor (rs_driver, internDecodeMsopPkt). The step from one
-    shot to the next is the difference of their azimuths. Until the first valid difference, the step
-    is computed from the speed in DIFOP.
+    Source: rs_driver, internDecodeMsopPkt.
 
     Args:
         lasers: the elevation of each laser, and its angle clockwise from the rotor's direction, in
@@ -363,8 +355,7 @@ def pace(f: Fields, shots: float, period: float, dual: int) -> Any:
     """Return the seconds from a packet to the next.
 
     Args:
-        shots: the number of shots of a packet with single return. With dual return, a packet has
-            half as many.
+        shots: the number of shots of a packet with single return.
         period: the seconds from shot to shot.
         dual: the return mode in DIFOP that means dual return.
     """
@@ -375,7 +366,6 @@ def rotation_values(i: int, shots: int, period: float, **others: Any) -> dict[st
     """Return the values of simulated packet i with single return.
 
     Args:
-        i: the number of the packet.
         shots: shots per packet.
         period: seconds from shot to shot.
         others: values of further fields.

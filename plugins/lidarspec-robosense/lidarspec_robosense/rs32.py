@@ -157,8 +157,7 @@ def is_plausible(f: Fields, lidar_type: int) -> Any:
 def is_plausible_bpearl(f: Fields, v4: bool) -> Any:
     """Return whether a packet can be from a Bpearl.
 
-    Azimuths have to be below 360 degrees. If `v4` is true, the bytes of version 4 are required.
-    Otherwise these bytes are not allowed, and the type must not be that of an RS-LiDAR-16 or -32.
+    `v4` selects Bpearls of version 4, or all other Bpearls.
     """
     is_version_4 = (f.series == V4_BYTES[0]) & (f.version == V4_BYTES[1])
     return (f.blocks.azimuth < 360) & (
@@ -182,10 +181,7 @@ def make_clock(source: Any, shots: int, model: Rotor) -> Clock:
 
 
 def points_16(f: Fields) -> Polar:
-    """Return the points of blocks with two firings of 16 lasers each.
-
-    DIFOP contains only the magnitudes of vertical angles. Their signs are the same in every unit.
-    """
+    """Return the points of blocks with two firings of 16 lasers each."""
     up = np.where(np.arange(16) < 8, -1, 1) * f.state.difop.pitch.on("channels")
     return points_of_groups(f, f.state.difop.return_mode == DUAL, RS16_ROTOR, (up, 0.0))
 
@@ -198,8 +194,7 @@ def points(f: Fields, model: Rotor) -> Polar:
 def sweep(i: int, block_us: float, lidar_type: int) -> dict[str, Any]:
     """Return the values of simulated packet i with single return.
 
-    The sensor starts at the beginning of 2024. `block_us` is the duration of a block in
-    microseconds.
+    `block_us` is the duration of a block in microseconds.
     """
     values = rotation_values(i, BLOCKS, block_us * 1e-6, lidar_type=lidar_type)
     seconds, micros = divmod(round(i * BLOCKS * block_us), 1_000_000)

@@ -96,10 +96,7 @@ def make_packet(lasers: int) -> Struct:
 
 
 def make_difop(lasers: int) -> Struct:
-    """Return the struct of the device information, with the angles of 128 lasers.
-
-    A model with fewer lasers uses the first angles.
-    """
+    """Return the struct of the device information, with the angles of 128 lasers."""
     other_vertical = () if lasers == 128 else ("others_vertical" / make_angles(128 - lasers),)
     other_horizontal = () if lasers == 128 else ("others_horizontal" / make_angles(128 - lasers),)
     start = (*DIFOP_HEAD, *DIFOP_VERSIONS, *DIFOP_UNIT, *DIFOP_TIME, *DIFOP_STATUS)
@@ -127,8 +124,7 @@ def is_plus(f: Fields) -> Any:
 def points(f: Fields, model: Rotor, variant: NDArray[np.float64] | None = None) -> Polar:
     """Return the points of a packet.
 
-    With dual return, the first block may contain the second return of a shot from the previous
-    packet. `variant` contains the firing times of an 80V in seconds.
+    `variant` contains the firing times of an 80V in seconds.
     """
     late = np.where(f.blocks[0].azimuth == f.blocks[1].azimuth, 0, 1)
     if variant is not None:
@@ -138,10 +134,7 @@ def points(f: Fields, model: Rotor, variant: NDArray[np.float64] | None = None) 
 
 
 def pace(f: Fields, shots: int, period: float) -> Any:
-    """Return the seconds from a packet to the next.
-
-    With dual return, two blocks are one shot.
-    """
+    """Return the seconds from a packet to the next."""
     return np.where(f.wave_mode.returns == DUAL, shots / 2, shots) * period
 
 
@@ -158,9 +151,8 @@ def firing_times(times: Any, counts: Any) -> NDArray[np.float64]:
 def even_firing_times(*counts: int) -> NDArray[np.float64]:
     """Return the firing time of each laser in seconds.
 
-    Lasers fire at 16 times, 3.236 us apart, in two groups that use the same times. `counts` has the
-    number of lasers at each time: 16 numbers for the first group, and 16 for the second. Source:
-    rs_driver.
+    Lasers fire at 16 times, 3.236 us apart. `counts` has the number of lasers at each time: 16
+    numbers for the first group, and 16 for the second group. Source: rs_driver.
     """
     return firing_times(np.tile(np.arange(16) * 3.236, 2), counts)
 
@@ -208,8 +200,6 @@ def make_model(id: str, name: str, rotor: Rotor, relative: str, variant: Any = N
     """Return the sensor of a Ruby or Ruby Plus; the id of a Ruby Plus contains "plus".
 
     Args:
-        id: the id of the sensor.
-        name: the name of the model.
         rotor: its firing times and geometry.
         relative: the id of the corresponding model of the other series.
         variant: the firing times that are used if packets identify the model as an 80V.

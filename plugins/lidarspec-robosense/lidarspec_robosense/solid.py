@@ -89,7 +89,6 @@ def make_packet(
     """Return the struct of a packet.
 
     Args:
-        model: the model.
         offset: the type of a block's time offset.
         parts: the fields of a block between the time offset and the channels.
         channel: the fields of a channel.
@@ -171,10 +170,7 @@ E1_DIFOP = Struct(
 
 
 def plausible(f: Fields, model: Scanner) -> Any:
-    """Return whether the packet number is possible.
-
-    A frame with dual return has up to twice as many packets as with single return.
-    """
+    """Return whether the packet number is possible."""
     return (f.pkt_psn >= model.first) & (f.pkt_psn < model.first + 2 * model.packets)
 
 
@@ -192,10 +188,7 @@ def pace(f: Fields, model: Scanner, dual: tuple[int, ...]) -> Any:
 def make_counter_and_clock(model: Scanner, dual: tuple[int, ...] = ()) -> dict[str, Any]:
     """Return the arguments of `Sensor` for the packet counter and the clock.
 
-    The counter restarts with each frame.
-
     Args:
-        model: the model.
         dual: the return modes with twice as many packets in a frame.
     """
     return {
@@ -210,10 +203,7 @@ def make_counter_and_clock(model: Scanner, dual: tuple[int, ...] = ()) -> dict[s
 
 
 def common_columns(f: Fields) -> dict[str, Any]:
-    """Return azimuth, elevation, time and ring of points.
-
-    The sent unit vectors have REP-103 axes.
-    """
+    """Return azimuth, elevation, time and ring of points."""
     channels = f.blocks.channels
     across = np.hypot(channels.x, channels.y)
     return {
@@ -227,9 +217,7 @@ def common_columns(f: Fields) -> dict[str, Any]:
 def points(f: Fields, returns: bool = False) -> Polar:
     """Return a point of each channel.
 
-    As in rs_driver, the range is multiplied by the length of the direction vector, which is 1
-    except for rounding. `returns` is whether blocks contain the number of the return. In this case,
-    it is assumed that two packets contain the returns of the same firings, as in the M1.
+    `returns` is whether blocks contain the number of the return.
     """
     channels = f.blocks.channels
     length = np.sqrt(channels.x**2 + channels.y**2 + channels.z**2)
@@ -268,11 +256,7 @@ def imu(f: Fields) -> Imu:
 
 
 def sweep(i: int, model: Scanner, mode: int = STRONGEST) -> dict[str, Any]:
-    """Return the values of simulated packet i.
-
-    The lines run back and forth, from the top of the field of view to the bottom. Each channel
-    scans an equal part of a line.
-    """
+    """Return the values of simulated packet i."""
     number = i % model.packets
     time = i / (model.packets * FRAME_RATE_HZ)
     progress = (number * model.blocks + np.arange(model.blocks))[:, None] / (

@@ -1,6 +1,6 @@
 """Calculate the stamps of messages in ROS's time.
 
-They are calculated from the times of the sensor's clock, or from arrival times.
+The stamps are calculated from the times of the sensor's clock, or from arrival times.
 """
 
 from __future__ import annotations
@@ -26,9 +26,7 @@ class MessageStamps:
     """The stamps of one sensor's messages, in ROS's time.
 
     Args:
-        wall: the host's clock, for a live sensor; None if a recording is played. If the computer's
-            clock is set, ROS's time jumps, but arrival times continue evenly. `wall` measures this
-            difference.
+        wall: the host's clock, for a live sensor; None if a recording is played.
 
     Attributes:
         clock: converts the sensor's clock to the host's.
@@ -42,8 +40,6 @@ class MessageStamps:
     def learn(self, device_ns: Times, host_ns: Times) -> None:
         """Update the conversion of the sensor's clock to the host's clock.
 
-        If the computer's clock was set, the step is recorded.
-
         Args:
             device_ns: the time of each packet by the sensor's clock, ns.
             host_ns: the arrival time of each packet, ns; packets with the time 0 are ignored.
@@ -55,10 +51,7 @@ class MessageStamps:
             self._wall_step_ns = step
 
     def stamp_scan(self, device_ns: int, host_ns: int, settings: Settings) -> int:
-        """Return the stamp of the next scan, ns.
-
-        The stamp is calculated from the sensor's time and the arrival time of the first point.
-        """
+        """Return the stamp of the next scan, ns."""
         return self._choose_stamp(
             device_ns, self.clock.stamp(device_ns, host_ns), host_ns, settings
         )
@@ -67,8 +60,8 @@ class MessageStamps:
         """Return the stamp of an IMU sample, ns.
 
         Args:
-            time_ns: the time of the sample, by the sensor's clock or by the host's clock.
-            by_clock: whether `time_ns` is by the sensor's clock; otherwise it is the arrival time.
+            time_ns: the time of the sample by the sensor's clock, or its arrival time.
+            by_clock: whether `time_ns` is by the sensor's clock.
         """
         host_ns = time_ns
         if by_clock:

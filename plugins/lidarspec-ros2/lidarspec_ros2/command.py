@@ -144,10 +144,7 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
 
 
 def _find_shared_memory(given: Mapping[str, Any], ros_args: Sequence[str]) -> SharedMemory:
-    """Return the settings of shared memory for the sensor that the parameters name.
-
-    The parameters are read from the command line, because the node does not exist yet.
-    """
+    """Return the settings of shared memory for the sensor that the parameters name."""
     from rclpy.utilities import get_rmw_implementation_identifier
 
     from lidarspec.transports.open_url import live_address

@@ -24,7 +24,6 @@ def make_status(
     """Return the state of a device for /diagnostics.
 
     Args:
-        name: the name of the node.
         reading: the statistics of the last second.
         device_warnings: warnings in addition to the warnings of the device.
         more: further values to report, by name.

@@ -2,8 +2,7 @@
 
 The node opens the sensor on configure, publishes while it is active, and closes the sensor on
 cleanup. One thread reads the device and publishes messages. The executor's thread serves
-transitions, parameters and commands. At the request of the reading thread, it also publishes
-diagnostics once a second, and deactivates the node while the sensor is disconnected.
+transitions, parameters and commands, and publishes diagnostics once a second.
 """
 
 from __future__ import annotations
@@ -105,7 +104,7 @@ class LidarNode(LifecycleNode):
         """Configure and activate the node.
 
         Raises:
-            LidarSpecError: if it cannot be configured.
+            LidarSpecError: if the node cannot be configured.
         """
         self.trigger_configure()
         if self.failure is not None:
@@ -332,10 +331,7 @@ class LidarNode(LifecycleNode):
                 self.get_logger().warning(f"unknown parameter {name!r} is ignored{close}")
 
     def _create_command_services(self, device: Device) -> None:
-        """Create a service for each command, and a parameter for each of its arguments.
-
-        The node's own services, for example get_state, keep their names.
-        """
+        """Create a service for each command, and a parameter for each of its arguments."""
         for name, command in device.sensor.commands.items():
             for argument in command.args:
                 if not self.has_parameter(f"{name}.{argument}"):

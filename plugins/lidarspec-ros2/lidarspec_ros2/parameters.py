@@ -33,10 +33,8 @@ class Parameter:
     Attributes:
         name: its name in ROS.
         default: the default value, which also defines the type.
-        text: its description.
         low, high: the limits of a number.
-        live: whether it can be changed while the node is configured. All other parameters are read
-            only during configuration.
+        live: whether the parameter can be changed while the node is configured.
     """
 
     name: str

@@ -23,9 +23,6 @@ _REMAP_OPTIONS = ("-r", "--remap")
 def read_parameters(arguments: Sequence[str], node_name: str) -> dict[str, Any]:
     """Return the parameters that the command line and its files give to a node.
 
-    As in ROS, a later value for the same pattern of node names replaces an earlier value. The
-    patterns are applied in the order in which they first appear.
-
     Args:
         arguments: the words of the command line; only words after ``--ros-args`` count.
         node_name: the default name of the node, which the command line can change.

@@ -9,9 +9,7 @@ Subscribers need no profile.
 An environment variable names the file with the profile. Fast DDS reads this file once, when the
 first participant of a process is created. `use_profile` sets the variable only for that time.
 
-The profile lists the transports that Fast DDS uses by default, shared memory and UDP. If discovery
-is limited to this computer, ROS adds its own UDP transport. The profile then lists only shared
-memory, because Fast DDS sends with the first of two transports of the same kind.
+The profile lists the transports that Fast DDS uses by default, shared memory and UDP.
 """
 
 from __future__ import annotations
@@ -93,8 +91,7 @@ def choose_shared_memory(
 
     Args:
         rmw: identifier of the middleware, for example rmw_fastrtps_cpp.
-        find_sensor: a function that returns the sensor, or None if it is not known yet. It is
-            called only if the node may provide a profile.
+        find_sensor: a function that returns the sensor, or None if the sensor is not known yet.
         is_serial: whether the sensor is on a serial line, which is too slow for large clouds.
     """
     free = find_free_bytes()
@@ -169,19 +166,13 @@ def has_user_profile() -> bool:
 
 
 def find_profile_variable() -> str:
-    """Return the name of the environment variable from which Fast DDS reads its profile.
-
-    The name depends on the version of Fast DDS that this process has loaded.
-    """
+    """Return the name of the environment variable from which Fast DDS reads its profile."""
     libraries = Path("/proc/self/maps").read_text(encoding="utf-8")
     return OLD_PROFILE_VARIABLE if "libfastrtps.so" in libraries else PROFILE_VARIABLE
 
 
 def find_largest_cloud_bytes(sensor: Sensor) -> int | None:
     """Return the size of a sensor's largest cloud in bytes; None if the spec is incomplete.
-
-    The size is calculated from simulated packets with one return for each firing, for the lowest
-    speed of rotation.
 
     Raises:
         LidarSpecError: if the sensor cannot be simulated.
@@ -214,6 +205,8 @@ def make_profile(segment_bytes: int, environment: Mapping[str, str]) -> str:
         segment_bytes: size of the segment of shared memory.
         environment: the environment variables, which may limit discovery to this computer.
     """
+    # If discovery is limited to this computer, ROS adds its own UDP transport, and Fast DDS sends
+    # with the first of two transports of the same kind.
     udp = "" if _is_local(environment) else "<transport_id>udp</transport_id>"
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <dds>
@@ -250,8 +243,7 @@ def _is_local(environment: Mapping[str, str]) -> bool:
 def use_profile(memory: SharedMemory) -> Iterator[None]:
     """Make Fast DDS read the profile when it creates its first participant.
 
-    The participant has to be created within the context. At the end of the context, the file and
-    the environment variable are removed.
+    The participant has to be created within the context.
     """
     if not memory.segment_bytes:
         yield

@@ -54,8 +54,6 @@ class Topics:
     """The topics of one sensor.
 
     Args:
-        node: the node that publishes them.
-        sensor: the opened sensor.
         played: whether a file is played; its time is published on /clock if `use_sim_time` is set.
         max_cloud_bytes: the largest size of a cloud that is not lost if subscribers use the
             reliability "best effort"; None if unknown.
@@ -185,10 +183,7 @@ class Topics:
         return self.stamps.stamp_scan(scan.stamp_ns, scan.host_ns, self._settings)
 
     def _get_publisher(self, kind: str) -> Any:
-        """Return the publisher of a kind of messages, created on first use.
-
-        The topic `scan` therefore has a publisher only after the first planar scan.
-        """
+        """Return the publisher of a kind of messages, created on first use."""
         if kind not in self._publishers:
             topic, message, depth = TOPICS[kind]
             qos = QoSProfile(depth=depth, reliability=self._reliability)

@@ -206,11 +206,7 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int, returns: int = 1) -> dict[str, Any]:
-    """Return the simulated values of packet i.
-
-    A line has four channels and is 120 degrees wide. The lines follow each other from top to
-    bottom, over 25 degrees.
-    """
+    """Return the simulated values of packet i."""
     count = (MAX_DATAGRAM_BYTES - HEADER_2_BYTES) // BLOCK_BYTES[returns]
     block_index = i % SIMULATED_PACKETS * count + np.arange(count)
     per_line = SIMULATED_PACKETS * count // SIMULATED_LINES

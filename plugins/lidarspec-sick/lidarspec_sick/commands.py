@@ -115,8 +115,6 @@ REQUEST_KINDS = ("sMN", "sRN", "sWN", "sEN")
 def make_message(cola: str, kind: str, method: str, content: tuple[Construct, ...]) -> Frame:
     """Return the frame of a message.
 
-    In CoLa B, a space follows the method, except in requests without content.
-
     Args:
         cola: "A" or "B".
         kind: the three letters of the message kind.

@@ -64,10 +64,7 @@ PROPERTY = BitStruct("reserved" / BitsInteger(7), "reflector" / BitsInteger(1))
 
 
 def make_module(version: int) -> Struct:
-    """Return the struct of a module in telegrams of version 3 or 4.
-
-    A module contains the beams of all its layers.
-    """
+    """Return the struct of a module in telegrams of version 3 or 4."""
     azimuth = "azimuth" / If(
         this._.beam_content.has_azimuth == 1,
         Scaled(Int16ul, AZIMUTH_STEP_RAD, "rad", -ZERO_AZIMUTH_STEPS * AZIMUTH_STEP_RAD),
@@ -175,8 +172,6 @@ def sweep(
     """Return the values of simulated telegram i: one segment, one module, one echo.
 
     Args:
-        i: the number of the telegram.
-        version: 3 or 4.
         elevations: elevations of the layers in degrees.
         beams: beams per segment.
         segments: segments per revolution.

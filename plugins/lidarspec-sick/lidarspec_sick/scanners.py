@@ -1,13 +1,13 @@
 """TiM5xx, TiM7xx, TiM871S, LMS1xx, LMS5xx and MRS1000: scanners with LMDscandata over TCP.
 
-They use CoLa B or CoLa A.
+The scanners use CoLa B or CoLa A.
 
 Source: the telegram listing 8014631; TiM55x, TiM56x and TiM57x operating instructions 8015883
 (steps, rate and angles, 5.3), LMS5xx 8013796 (steps, 3.5), MRS1000 8020494 (layers, 3.5.10). The
 steps, rates and angles of TiM7xx and LMS1xx, the rates of an LMS5xx, and the ranges of all models
 are assumed, because no data sheets were available. Telegrams contain the settings of the scanner.
-Models are therefore distinguished by settings that other models do not support. If this is not
-sufficient, the reply to `get_identity` contains the model.
+Models are distinguished by settings that other models do not support. The reply to `get_identity`
+contains the model.
 """
 
 from __future__ import annotations
@@ -46,8 +46,6 @@ ANGLE_TOLERANCE_DEG = 1e-4
 @dataclass(frozen=True)
 class ScannerFamily:
     """The possible settings of a family of models.
-
-    A simulated scanner uses the first rate and the first step.
 
     Attributes:
         rates: the possible scans per second.
@@ -143,9 +141,7 @@ def sweep(i: int, family: ScannerFamily, echoes: int = 1) -> dict[str, Any]:
 def make_frames(family: ScannerFamily, cola: str) -> dict[str, Frame]:
     """Return the frames of scans, of commands and of replies.
 
-    Scans can be received in CoLa A and in CoLa B; the frames in `cola` come first. Commands and
-    replies are only in `cola`. There are frames for scans with one echo, and with `family.echoes`
-    echoes.
+    Scans can be received in both versions of CoLa, commands and replies in `cola` only.
     """
     forms = sorted("AB", key=lambda form: form != cola)
     frames = {{"A": "text", "B": "scan"}[form]: make_scan_frame(form, 1) for form in forms}
@@ -166,8 +162,7 @@ def configure(sensor: Sensor, *, cola: Literal["A", "B"] = "B", echoes: int = 0)
 
     Args:
         cola: the version of CoLa for commands. Scans are read in both versions.
-        echoes: the number of echoes of a beam; 0 for the maximum of the scanner. Scans with one
-            echo are read as well.
+        echoes: the number of echoes of a beam; 0 for the maximum of the scanner.
 
     Raises:
         UsageError: if the scanner has fewer echoes.

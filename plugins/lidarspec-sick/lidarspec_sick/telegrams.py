@@ -52,7 +52,7 @@ MAX_BEAMS = 1141  # of an LMS5xx with steps of a sixth of a degree
 def make_binary_frame(*parts: Construct, max_length: int = 0, **more: Any) -> Frame:
     """Return the frame of a telegram in CoLa B.
 
-    It has four bytes 02, a length, the content, and the XOR of the content.
+    A telegram has four bytes 02, a length, the content, and the XOR of the content.
     """
     struct = Struct(
         "magic" / Const(b"\x02\x02\x02\x02"),

@@ -10,13 +10,11 @@ only after its descriptor. The kinds are `node`, `express`, `ultra`, `dense`, `u
 another kind, and starts as if its descriptor had been received, which is needed for recordings that
 begin after the descriptor.
 
-For all kinds, a scan ends when the azimuth of the points passes zero. Nodes and HQ capsules also
-mark the first node after zero with a bit. Other capsules do not, and their start angle can pass
-zero a capsule earlier or later.
+For all kinds, a scan ends when the azimuth of the points passes zero.
 
-Nodes have no checksum, and are accepted in runs of ten without a gap. The docstring of `nodes`
-contains the measured rates of false nodes. Frames do not contain the times of their points, so all
-points of a frame have the time of the frame.
+Nodes have no checksum, and are accepted in runs of ten without a gap. The docstring of the module
+`nodes` contains the measured rates of false nodes. Frames do not contain the times of their points,
+so all points of a frame have the time of the frame.
 
 Requests, descriptors, and replies with information and configuration were verified with the
 recorded communication of a live A1. Nodes, express and ultra capsules were verified with bytes that

@@ -51,10 +51,7 @@ SERIES = {
 
 
 def name_model(series: str, models: tuple[int, ...], low: int) -> str:
-    """Return the name of a model, for example "RPLIDAR S2, S2M1".
-
-    If the series has one model, the result is only the series, for example "RPLIDAR C1".
-    """
+    """Return the name of a model, for example "RPLIDAR S2, S2M1"."""
     if len(models) > 1:
         return f"RPLIDAR {series}, {series}M{low}"
     return f"RPLIDAR {series}"
@@ -134,10 +131,7 @@ def make_stream_descriptor(kind: int, size: int) -> Frame:
 
 
 def is_config_plausible(f: Fields) -> Any:
-    """Return whether a reply has the length that its key requires.
-
-    The length is not checked if the width of the value is not documented.
-    """
+    """Return whether a reply has the length that its key requires."""
     size = take(_VALUE_BYTES, f.key)
     return np.isnan(size) | (f.descriptor.length == 4 + size)
 

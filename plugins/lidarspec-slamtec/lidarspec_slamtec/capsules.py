@@ -165,10 +165,7 @@ def point_step(f: Fields, count: int) -> Any:
 
 
 def uncompensated_angles(f: Fields, cabins: int, points: int) -> Any:
-    """Return the angles of the points without compensation, (n, cabins, points).
-
-    Angles are clockwise in degrees.
-    """
+    """Return clockwise angles in degrees without compensation, (n, cabins, points)."""
     count = cabins * points
     step = point_step(f, cabins * points)
     return stack(
@@ -222,11 +219,7 @@ def compensation(mm: Any) -> Any:
 
 
 def ultra_points(f: Fields) -> Polar:
-    """Return 96 points per capsule, three for each cabin.
-
-    A cabin contains a distance, `major`. It also contains two differences, `predict1` and
-    `predict2`, from this distance or from the distance of the next cabin.
-    """
+    """Return 96 points per capsule, three for each cabin."""
     code = f.cabins.major
     next_code = following(f.cabins.major)
     major = take(CODE_MILLIMETRES, code)
@@ -245,11 +238,7 @@ def ultra_points(f: Fields) -> Polar:
 
 
 def ultra_dense_points(f: Fields) -> Polar:
-    """Return 64 points per capsule.
-
-    The low 10 to 13 bits of a point are the distance, in steps of 2 to 5 mm, and the high bits are
-    the quality. The scale of the point determines how many bits the distance has.
-    """
+    """Return 64 points per capsule."""
     cabins = f.cabins
     scale = stack(cabins.first_scale, cabins.second_scale)
     code = stack(
@@ -266,11 +255,7 @@ def ultra_dense_points(f: Fields) -> Polar:
 
 
 def encode_ultra(polar: Polar) -> Mapping[str, Any]:
-    """Return the fields of ultra capsules with these ranges.
-
-    If the difference from the reference is too large for a prediction, the point is encoded as a
-    point without a return.
-    """
+    """Return the fields of ultra capsules with these ranges."""
     mm = np.asarray(polar.range) * 1000
     code = nearest_codes(mm[..., 0])
     next_code = np.append(code.reshape(-1)[1:], 0).reshape(code.shape)
@@ -308,11 +293,7 @@ def encode_prediction(mm: Any, code: Any) -> Any:
 
 
 def encode_ultra_dense(polar: Polar) -> Mapping[str, Any]:
-    """Return the fields of ultra-dense capsules with these ranges.
-
-    Each range is encoded with the finest scale that can represent it. All points have the same
-    quality.
-    """
+    """Return the fields of ultra-dense capsules with these ranges."""
     mm = np.asarray(polar.range) * 1000
     scale = np.searchsorted(SCALE_STARTS_MM, mm, side="right") - 1
     steps = np.rint((mm - SCALE_STARTS_MM[scale]) / (2 + scale)).astype(np.int64)

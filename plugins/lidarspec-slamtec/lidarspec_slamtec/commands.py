@@ -39,11 +39,7 @@ def make_plain_request(cmd: str, **more: Any) -> Command:
 def make_request(
     frame: str, reply: str | tuple[str, ...], values: Mapping[str, Any] | None = None, **more: Any
 ) -> Command:
-    """Return the command for a request with a reply.
-
-    The request is sent again if no reply arrives. This does no harm, because requests for
-    information do not change the sensor, and a repeated request for a scan starts a new stream.
-    """
+    """Return the command for a request with a reply."""
     return Command(
         frame, values or {}, reply=reply, retries=1, only_stopped=not more.get("starts"), **more
     )
@@ -68,8 +64,7 @@ def make_mode_request(key: int) -> Command:
 def make_express_request(mode: int | None = None) -> Command:
     """Return the request for capsules of one scan mode.
 
-    If `mode` is None, the mode is an argument of the command. The reply has a descriptor that
-    depends on the mode. The command `get_answer_type` returns the type of this descriptor.
+    If `mode` is None, the mode is an argument of the command.
     """
     values = {"flags": 0, "param": 0} | ({} if mode is None else {"mode": mode})
     args = {"mode": ("mode", 0, 0xFF)} if mode is None else {}

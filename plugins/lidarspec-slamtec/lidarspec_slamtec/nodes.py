@@ -14,12 +14,10 @@ The table shows the number of false nodes, i.e. accepted nodes that were not sen
     beginning in the middle of a node, 300 x         135        9       0       0
     nodes with 1 % of the bytes damaged, 2 MiB     7 430    1 811   1 760   1 732
 
-If distances hardly change, every cabin of a capsule has the same bits, which explains the numbers
-in rows two and three. Nodes are searched for only after the descriptor 81. Capsules are therefore
-searched for nodes only if a later descriptor was lost. The false nodes in the last row continue an
-accepted run at a shifted offset, which no run length prevents. Of 419,430 nodes that were sent,
-411,423 are found with runs of 1, and 395,728 with runs of 10. The distances in the streams have a
-noise of a few millimetres. A test repeats this with less data.
+Nodes are searched for only after the descriptor 81. Capsules are therefore searched for nodes only
+if a later descriptor was lost. The false nodes in the last row continue an accepted run at a
+shifted offset, which no run length prevents. Of 419,430 nodes that were sent, 411,423 are found
+with runs of 1, and 395,728 with runs of 10. A test repeats this with less data.
 
 Source: RPLIDAR interface protocol, "SCAN"; HQ capsules: the vendor's SDK (sl_lidar_cmd.h,
 handler_hqnode.cpp).

@@ -102,10 +102,7 @@ class SimulatedUnit:
         return (answers.make_config(key, values[key]),) if key in values else ()
 
     def reply_descriptor(self, request: Mapping[str, Any]) -> tuple[str, ...]:
-        """Return the descriptor of the requested scan mode; empty for an unknown mode.
-
-        Mode 0 of an express request is the plain express scan.
-        """
+        """Return the descriptor of the requested scan mode; empty for an unknown mode."""
         number = request["mode"]
         if number >= len(self.modes):
             return ()

@@ -170,19 +170,13 @@ DATA = Struct(
 
 
 def points(f: Fields) -> Cartesian:
-    """Return the points of a frame, in axes ahead, left and up.
-
-    The radar's x is to the right and its y ahead.
-    """
+    """Return the points of a frame, in axes ahead, left and up."""
     members = f.points
     return Cartesian(x=members.y, y=-members.x, z=members.z, extra={"velocity": members.velocity})
 
 
 def directions(i: int) -> tuple[Any, Any]:
-    """Return azimuth and elevation in radians of the simulated points of frame i.
-
-    The points form a fan of 120 degrees that moves up and down by 15 degrees.
-    """
+    """Return azimuth and elevation in radians of the simulated points of frame i."""
     return np.deg2rad(np.linspace(-60, 60, SIMULATED_POINTS)), np.deg2rad(
         15 * np.sin(i / 7 + np.arange(SIMULATED_POINTS))
     )

@@ -327,10 +327,7 @@ def date_values(i: int, rate: float) -> dict[str, Any]:
 
 
 def pvt_sweep(i: int) -> dict[str, Any]:
-    """Return the values of simulated solution i, at five solutions a second.
-
-    The receiver moves northward at 1 m/s from the manual's position.
-    """
+    """Return the values of simulated solution i, at five solutions a second."""
     valid = {"valid.date": 1, "valid.time": 1, "valid.fully_resolved": 1}
     return {
         **date_values(i, 5),
@@ -356,10 +353,7 @@ def timeutc_sweep(i: int) -> dict[str, Any]:
 
 
 def pulse_sweep(i: int) -> dict[str, Any]:
-    """Return the simulated announcement of the pulse at second i + 1.
-
-    Second 0 is the beginning of GPS week 2400.
-    """
+    """Return the simulated announcement of the pulse at second i + 1."""
     return {"time_of_week": (i + 1) % WEEK_S, "week": 2400 + int((i + 1) // WEEK_S), "flags.utc": 1}
 
 

@@ -170,11 +170,7 @@ VLS128_LASERS = np.arange(4 * SLOTS).reshape(4, SLOTS)
 
 
 def make_vls128_firings(returns: int) -> Firings:
-    """Return the firing pattern for 1 or 2 returns.
-
-    The 128 lasers are in four blocks, or in four pairs of blocks with dual return. Lasers fire in
-    groups of eight at once. After eight groups there is a pause.
-    """
+    """Return the firing pattern for 1 or 2 returns."""
 
     def fill_blocks(values: Any) -> Any:
         table = np.reshape(values, (4, SLOTS))
@@ -287,8 +283,6 @@ def make_related_model(id: str, model: str, firings: Firings, **facts: Any) -> S
     """Return another model of the family, derived from the VLP-16.
 
     Args:
-        id: the id of the model.
-        model: the name of the model.
         firings: its firing pattern.
         facts: further arguments of `Sensor` that differ from those of a VLP-16.
     """

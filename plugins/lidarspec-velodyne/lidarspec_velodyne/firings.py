@@ -81,10 +81,7 @@ class Firings:
 
 
 def points(f: Fields, model: Firings, last_block: LastBlock = "previous") -> Polar:
-    """Return the points of a packet.
-
-    The sensor rotates clockwise from its forward axis.
-    """
+    """Return the points of a packet."""
     dual = model.returns == 2 if model.returns else f.return_mode == DUAL
     block = np.arange(model.blocks)[:, None]
     clockwise = (
@@ -123,7 +120,7 @@ def block_step(f: Fields, dual: Any, model: Firings, last_block: LastBlock) -> A
 def configure(sensor: Sensor, /, *, last_block: LastBlock) -> Sensor:
     """Return the sensor with a rule for the last block.
 
-    The module's docstring describes the rules.
+    "previous" uses the last valid step again. "invalid" makes the points of the block invalid.
     """
 
     def set_rule(function: Any) -> Any:
@@ -137,10 +134,7 @@ def configure(sensor: Sensor, /, *, last_block: LastBlock) -> Sensor:
 
 
 def pace(f: Fields, model: Firings) -> Any:
-    """Return the seconds from a packet to the next.
-
-    With dual return, a packet has half as many shots as with single return.
-    """
+    """Return the seconds from a packet to the next."""
     shots = BLOCKS // model.blocks_per_azimuth
     return np.where(f.return_mode == DUAL, shots // 2, shots) * model.period
 

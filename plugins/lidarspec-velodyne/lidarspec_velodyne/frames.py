@@ -138,10 +138,7 @@ POSITION = Struct(
 
 
 def plausible(f: Fields) -> Any:
-    """Return whether azimuths are at most 360 degrees and the model is not a VLP-32C.
-
-    Azimuths are documented up to 359.99 degrees; old firmware sends 360.00.
-    """
+    """Return whether azimuths are at most 360 degrees and the model is not a VLP-32C."""
     return (f.blocks.azimuth <= 360) & (f.product != VLP32C_PRODUCT)
 
 
@@ -151,10 +148,7 @@ def is_plausible_vlp32c(f: Fields) -> Any:
 
 
 def is_plausible_single(f: Fields) -> Any:
-    """Return whether azimuths, banks and return mode are those of single return.
-
-    A packet has one block of each bank, in order, three times.
-    """
+    """Return whether azimuths, banks and return mode are those of single return."""
     return (
         (f.blocks.azimuth <= 360)
         & (f.blocks.flag == np.tile(BANKS, (3, 1)))
@@ -168,10 +162,7 @@ def is_plausible_dual(f: Fields) -> Any:
 
 
 def is_plausible_position(f: Fields) -> Any:
-    """Return whether the PPS state is known and the NMEA sentence is text.
-
-    A data packet has flags in place of the sentence, which are not text.
-    """
+    """Return whether the PPS state is known and the NMEA sentence is text."""
     return (f.pps <= 3) & ((f.nmea == 0) | ((f.nmea >= 9) & (f.nmea < 127)))
 
 
@@ -196,8 +187,6 @@ CLOCK_STATUS = ClockStatus(
 
 def nmea_seconds(f: Fields) -> Any:
     """Return the time of the first valid sentence, seconds since 1970.
-
-    Sentences are ignored while the clock is not locked to the PPS.
 
     Returns:
         The time for the packet with the sentence, nan for all other packets, (n,).
@@ -238,10 +227,7 @@ def make_sentence(seconds: float) -> dict[str, Any]:
 
 
 def sweep_position(i: int) -> dict[str, Any]:
-    """Return the values of simulated position packet i.
-
-    The sensor was switched on at the beginning of 2024.
-    """
+    """Return the values of simulated position packet i."""
     return {
         "timestamp": i / POSITION_RATE_HZ % CLOCK_WRAP_S,
         "pps": PPS_LOCKED,

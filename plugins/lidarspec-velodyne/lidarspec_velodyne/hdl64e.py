@@ -286,10 +286,7 @@ def _parse_number(laser: ElementTree.Element, name: str) -> float:
 
 
 def pace(f: Fields, unit: UnitCalibration) -> Any:
-    """Return the seconds from a packet to the next.
-
-    A packet has six shots, or three with dual return.
-    """
+    """Return the seconds from a packet to the next."""
     return np.where(is_dual(f), 3, 6) * unit.period
 
 

@@ -1,11 +1,9 @@
 """Access to the page: the token of its link, and the Host and Origin headers.
 
-Each server makes a token. Each request must have the token in its query, whether it is for a page,
-a script, a download or the socket. Other users of this computer can connect to the server, but do
-not know the token. The token is not kept in a cookie, because browsers send the cookies of one port
-to all ports of this computer, so a server of another user would receive it. The checks of the
-headers Host and Origin refuse requests from other pages in the same browser, including pages at a
-name that was made to point to this computer.
+Each request must have the token of the server in its query. Other users of this computer can
+connect to the server, but do not know the token. The token is not kept in a cookie, because
+browsers send the cookies of one port to all ports of this computer. The checks of the headers Host
+and Origin refuse requests from other pages in the same browser.
 """
 
 from __future__ import annotations
@@ -133,11 +131,8 @@ class Guard:
         return None
 
     def _is_own_host(self, host: str) -> bool:
-        """Return whether a Host header names this server.
-
-        A server that listens on all interfaces accepts any IP address, but only its own name,
-        because other names can be made to point to this computer.
-        """
+        """Return whether a Host header names this server."""
+        # a name that is not the server's own can be made to point to this computer
         name, _, port = host.rpartition(":") if host.rpartition("]")[2] else (host, "", "")
         if (port or "80") != str(self._port):
             return False
@@ -163,11 +158,9 @@ def add_token(page: str, token: str) -> str:
 
 
 def write_opening_page(folder: Path, link: str) -> Path:
-    """Write a page that redirects to the link, and return its path.
-
-    A browser is started with this page and not with the link, because other users can see the
-    command lines of all programs, and the link contains the token. Only the user can read the page.
-    """
+    """Write a page that redirects to the link, and return its path."""
+    # Only the user can read the page. Other users can see the command lines of all programs, so a
+    # browser is not started with the link.
     path = folder / "open.html"
     address = escape(link)
     text = (

@@ -59,10 +59,7 @@ class ShownScan:
         self._message_max_points = -1
 
     def message(self, max_points: int) -> bytes:
-        """Return the scan as a message of at most `max_points` points.
-
-        The message is cached until `max_points` changes.
-        """
+        """Return the scan as a message of at most `max_points` points."""
         if max_points != self._message_max_points:
             self._message = make_scan_message(
                 self.scan,
@@ -149,10 +146,7 @@ class Broadcast:
 
     @property
     def can_seek(self) -> bool:
-        """Whether the source is a file that supports seeking.
-
-        Seeking is not supported if the scans are selected by number.
-        """
+        """Whether the source is a file that supports seeking."""
         return not self.is_live and not self._select.is_counted and self.source != "-"
 
     @property
@@ -180,10 +174,7 @@ class Broadcast:
 
     @property
     def began_ns(self) -> int:
-        """The arrival time of the first packet of the first scan, ns since 1970.
-
-        It is 0 if the time is unknown.
-        """
+        """The arrival time of the first scan's first packet, ns since 1970; 0 if unknown."""
         if self._first_scan is None:
             return 0
         return self._first_scan.host_ns
@@ -297,10 +288,7 @@ class Broadcast:
         return self.is_live or not (self.paused or self._feed.ended)
 
     def _read(self, read: Callable[[], None]) -> None:
-        """Read from the feed.
-
-        A seek beyond the end of a file selects no packets, which is not an error.
-        """
+        """Read from the feed."""
         try:
             read()
         except UsageError:
@@ -326,10 +314,7 @@ class Broadcast:
         return LiveScans(self.device, played=True, select=select)
 
     def _update(self) -> None:
-        """Update the scan, the statistics and the state of the file.
-
-        If one of them has changed, `news` is called.
-        """
+        """Update the scan, the statistics and the state of the file."""
         has_news = self._update_scan()
         if self._update_statistics():
             has_news = True
@@ -398,11 +383,7 @@ class Broadcast:
         }
 
     def _find_clock_offset(self, clock: ClockReport) -> float | None:
-        """Return by how many seconds the sensor's clock is ahead of the host's clock.
-
-        If the sensor's clock has no date, the result is the change of this difference since reading
-        began. Returns None if the difference is unknown.
-        """
+        """Return the seconds by which the sensor's clock is ahead; None if unknown."""
         if not math.isnan(clock.error_s):
             return clock.error_s
         samples = self._feed.clock.samples
@@ -411,10 +392,7 @@ class Broadcast:
         return clock.offset_s - samples[0].offset_s
 
     def _find_arrival(self, scan: Scan) -> float:
-        """Return the arrival time of a scan's last packet, in seconds since 1970.
-
-        For a file, or if the arrival time is unknown, this is the current time.
-        """
+        """Return the arrival time of a scan's last packet, in seconds since 1970."""
         if self.is_live and len(scan):
             host_ns = scan.provenance(len(scan) - 1).host_ns
             if host_ns:
@@ -422,11 +400,7 @@ class Broadcast:
         return self.now()
 
     def _find_position(self, scan: Scan) -> float:
-        """Return the position of a scan, in seconds after the first scan.
-
-        The position is calculated from arrival times for a live source, and from the times of the
-        scans for a file. In a file without times, the scans are counted.
-        """
+        """Return the position of a scan, in seconds after the first scan."""
         first = self._first_scan
         assert first is not None
         if self.is_live:

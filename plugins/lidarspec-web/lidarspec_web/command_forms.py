@@ -26,8 +26,7 @@ def make_form(sensor: Sensor, name: str) -> dict[str, Any]:
 def find_restart(sensor: Sensor) -> dict[str, str] | None:
     """Return the commands that stop the data and start it again.
 
-    The commands have no arguments. Commands in `on_open` are preferred. Returns None if the sensor
-    lacks one of the two commands.
+    Returns None if the sensor lacks one of the two commands.
     """
     names = [*sensor.on_open, *sensor.commands]
     plain = [name for name in names if not sensor.commands[name].args]
@@ -39,11 +38,7 @@ def find_restart(sensor: Sensor) -> dict[str, str] | None:
 
 
 def _find_group(sensor: Sensor, name: str) -> str:
-    """Return the group of a command: "switch", "ask" or "set".
-
-    "switch" commands start or stop the data, "ask" commands read a value, and "set" commands change
-    a setting.
-    """
+    """Return the group of a command: "switch", "ask" or "set"."""
     command = sensor.commands[name]
     if command.starts or command.stops:
         return "switch"

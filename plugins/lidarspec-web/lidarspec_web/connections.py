@@ -3,7 +3,6 @@
 A connection is pending until one of its requests has the token. A pending connection is closed if
 this takes too long. The oldest pending connection is closed if there are too many connections. Idle
 connections of other users therefore never block a browser, which sends its request at once.
-Connections with the token are closed by their pages, or by the timeouts of the server.
 """
 
 from __future__ import annotations

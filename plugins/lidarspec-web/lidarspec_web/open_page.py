@@ -2,9 +2,7 @@
 
 A page requests each scan after it has drawn the previous scan, and receives the newest scan. A slow
 or hidden page therefore causes little work, and no page shows old data. Requests are JSON objects;
-the entry `do` is the name of the handler. Slow requests run in threads (`page_requests`). Between
-scans, the server sends replies to requests, and twice a second the state of the source. While the
-page shows bytes, the server also sends the newest frame.
+the entry `do` is the name of the handler. Slow requests run in threads (`page_requests`).
 
 While a page is paused, a live source continues. A copy of the bytes at the time of the pause is
 kept for this page (`_frozen`).
@@ -64,7 +62,6 @@ class OpenPage:
 
     Args:
         answers: makes the messages.
-        socket: the socket of the page.
         workers: the threads for slow requests.
     """
 
@@ -351,10 +348,7 @@ class OpenPage:
         self.notify()
 
     def _show_frame(self, request: Mapping[str, Any]) -> None:
-        """Reply with the frame that the page requests.
-
-        The request has a point, the number of damaged bytes, or the number of a frame.
-        """
+        """Reply with the frame that the page requests."""
         backlog = self._backlog
         point = request.get("point")
         if isinstance(point, dict):

@@ -26,7 +26,7 @@ ANSWER_THREADS = 4
 
 
 class Workers:
-    """The threads of a server, by purpose. Threads are started when they are needed."""
+    """The threads of a server, by purpose."""
 
     def __init__(self) -> None:
         self.answers = ThreadPoolExecutor(ANSWER_THREADS, "page-answers")

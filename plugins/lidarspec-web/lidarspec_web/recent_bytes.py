@@ -2,9 +2,7 @@
 
 A decoder passes its input, and the frames that it has found, to `RecentBytes` (a
 `DecoderObserver`). Both are stored unchanged, up to a limit, so that reading is not slowed down.
-The bytes of a frame are copied only on request. Bytes that the decoder has skipped are copied at
-once, because their input is soon dropped. Skipped bytes are explained when a page requests their
-explanation.
+The bytes of a frame are copied only on request.
 """
 
 from __future__ import annotations
@@ -211,11 +209,7 @@ class RecentBytes:
         return result.take(number - result.first_number)
 
     def find_point_frame(self, point_origin: PointOrigin) -> StoredFrame | None:
-        """Return the frame that contained a point.
-
-        If the frame is no longer stored, its bytes are taken from the scan. Returns None if the
-        frame type has a wire form, because a scan does not have the bytes of such frames.
-        """
+        """Return the frame that contained a point; None if the frame is not available."""
         with self._lock:
             following = bisect_right(self._results, point_origin.offset, key=lambda one: one.offset)
             result = self._results[following - 1] if following else None
@@ -238,11 +232,7 @@ class RecentBytes:
             return [piece for piece in self._damaged if piece.number >= number]
 
     def explain_damaged(self, piece: DamagedBytes) -> dict[str, Any]:
-        """Return the explanation of damaged bytes, in the form of `Explanation.to_dict`.
-
-        The result has the rows of all damaged frames, and of the bytes between these frames. The
-        notes describe changes that explain the damage.
-        """
+        """Return the explanation of damaged bytes, in the form of `Explanation.to_dict`."""
         parts = list(
             explain_piece(self.sensor, InputPiece(piece.offset, piece.data, "", piece.is_datagram))
         )

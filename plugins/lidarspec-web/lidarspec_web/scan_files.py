@@ -89,10 +89,7 @@ class ScanSaver:
             path.unlink()
 
     async def _write(self, path: Path, shown: ShownScan) -> None:
-        """Write a scan to a file, after a pause that leaves processor time to open pages.
-
-        The pause is as long as writing the previous scan took, at most `MAX_REST_S`.
-        """
+        """Write a scan to a file, after a pause that leaves processor time to open pages."""
         loop = asyncio.get_running_loop()
         async with self._writing:
             await asyncio.sleep(self._rests_until - time.monotonic())

@@ -67,10 +67,7 @@ CSPC_MODELS = {
 
 
 def make_angle() -> Construct:
-    """Return the struct of the first or the last angle of a packet (FSA or LSA).
-
-    It has the angle in steps of 1/64 degree, and a check bit of 1.
-    """
+    """Return the struct of the first or the last angle of a packet (FSA or LSA)."""
     return ByteSwapped(
         BitStruct(
             "angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / Const(1, BitsInteger(1))
@@ -79,10 +76,7 @@ def make_angle() -> Construct:
 
 
 def plausible(f: Fields) -> Any:
-    """Return whether angles are below 360 degrees and the number of samples is valid.
-
-    A packet has at least one sample, and a zero packet has exactly one sample.
-    """
+    """Return whether angles are below 360 degrees and the number of samples is valid."""
     return (
         (f.fsa.angle < 360)
         & (f.lsa.angle < 360)
@@ -128,11 +122,7 @@ def make_points_function(sample_format: SampleFormat) -> Callable[[Fields], Poin
 
 
 def points(f: Fields, sample_format: SampleFormat) -> Polar:
-    """Return points at equal steps from the first angle (FSA) to the last angle (LSA).
-
-    On models that measure by triangulation, angles are corrected by an amount that depends on the
-    distance ("angle analysis").
-    """
+    """Return points at equal steps from the first angle (FSA) to the last angle (LSA)."""
     raw = spread(f.fsa.angle, f.lsa.angle, f.lsn, full=360.0)  # degrees, (n, LSN)
     clockwise = (
         raw
@@ -151,10 +141,7 @@ def points(f: Fields, sample_format: SampleFormat) -> Polar:
 
 
 def sweep(i: int, model: Model) -> dict[str, float]:
-    """Return the simulated values of packet i.
-
-    A revolution consists of a zero packet, full packets and a shorter packet.
-    """
+    """Return the simulated values of packet i."""
     steps = int(model.rate / SIMULATED_SPEED_HZ)
     packet = i % (1 + -(-(steps - 1) // SAMPLES_PER_PACKET))
     first = 0 if packet == 0 else 1 + (packet - 1) * SAMPLES_PER_PACKET
@@ -178,8 +165,7 @@ def make_id(name: str) -> str:
 def contains_state(f: Fields, slowest: float) -> Any:
     """Return whether a packet contains the device's state.
 
-    A zero packet contains the scan frequency. All other packets have the state in the same bits, or
-    0 if the model has no state (protocol, CT).
+    Source: protocol, CT.
     """
     return (f.ct.start == 0) & (f.ct.frequency > slowest)
 
@@ -197,10 +183,7 @@ def describe_difference(own: Model, other: Model) -> str | Relative:
 
 
 def relatives(name: str) -> dict[str, str | Relative]:
-    """Return, by id, how to recognize the other models with the same sample size.
-
-    The other models include models of CSPC, which send the same packet.
-    """
+    """Return, by id, how to recognize the other models with the same sample size."""
     own_model = MODELS[name]
     models = {
         make_id(other): describe_difference(own_model, model)
