@@ -35,11 +35,11 @@ def test_the_page_has_the_signals_of_the_connector(row: list[str]) -> None:
 @pytest.mark.parametrize(
     "sentence",
     [
-        "**Internal control** holds 10 +- 0.1 Hz, at most 3 s after power-up: connect PWM to GND.",
-        "An open pin is not allowed.",
+        "**Internal control**: connect PWM to GND. An open pin is not allowed.",
+        "The speed is 10 +- 0.1 Hz, at the latest 3 s after power-up.",
         "20 to 50 kHz (30 kHz recommended)",
         "a duty cycle above 45 % and below 55 % for at least 100 ms",
-        "the duty cycle starts, stops and sets the speed, until the power is switched off",
+        "until the power is switched off, the duty cycle starts and stops the motor and sets its",
         "The speed at a given duty cycle differs between units",
     ],
 )
