@@ -1,7 +1,4 @@
-"""Functions that make simple arrays quickly, find equal values, and set the memory allocator.
-
-The arrays have one repeated value, consecutive numbers, or selected rows of another array.
-"""
+"""Functions that make simple arrays quickly, find equal values, and set the memory allocator."""
 
 from __future__ import annotations
 
@@ -21,10 +18,7 @@ LARGE_BLOCK_BYTES = 1 << 24
 
 
 def repeat(value: int, *shape: int) -> NDArray[np.int64]:
-    """Return a read-only array of this shape with one value everywhere.
-
-    The result is the same as that of `np.broadcast_to`, in a tenth of the time.
-    """
+    """Return a read-only array of this shape with one value everywhere."""
     memory = value.to_bytes(8, sys.byteorder, signed=True)
     return np.ndarray(shape, np.int64, memory, 0, (0,) * len(shape))
 
@@ -32,10 +26,7 @@ def repeat(value: int, *shape: int) -> NDArray[np.int64]:
 def select_values(
     values: NDArray[np.int64], which: NDArray[np.bool_] | NDArray[np.intp] | slice
 ) -> NDArray[np.int64]:
-    """Return the values that a mask, indices or a slice select, (k,).
-
-    The result for a zero-stride array, such as from `repeat`, is a zero-stride array.
-    """
+    """Return the values that a mask, indices or a slice select, (k,)."""
     value = broadcast_value(values)
     if value is None or isinstance(which, slice):
         return values[which]
@@ -43,10 +34,7 @@ def select_values(
 
 
 def count_up(count: int) -> NDArray[np.int64]:
-    """Return the numbers from 0 to `count` - 1, (count,), read-only.
-
-    Small arrays share the same memory.
-    """
+    """Return the numbers from 0 to `count` - 1, (count,), read-only."""
     if count <= MAX_SHARED_COUNT:
         return _shared_numbers()[:count]
     return np.arange(count)
@@ -75,9 +63,7 @@ def group_by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np
     """Return the distinct values, ascending, each with the indices at which it occurs.
 
     Args:
-        values: the values.
-        few: up to this number of distinct values, the values are searched one by one, which is
-            faster than sorting.
+        few: the number of distinct values up to which searching is faster than sorting.
     """
     values_found = list[int]()
     left = values
@@ -95,9 +81,6 @@ def mark_changes(*columns: NDArray[Any]) -> NDArray[np.bool_]:
     """Return a mask of the rows that differ from the row before, (n,).
 
     The first row counts as different.
-
-    Args:
-        columns: one or more arrays, (n,) each. A row has one value of each.
     """
     is_changed = np.zeros(len(columns[0]), np.bool_)
     is_changed[:1] = True
@@ -107,11 +90,7 @@ def mark_changes(*columns: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def split_runs(*columns: NDArray[Any]) -> list[slice]:
-    """Return slices of consecutive rows in which no column changes.
-
-    Args:
-        columns: one or more arrays, (n,) each.
-    """
+    """Return slices of consecutive rows in which no column changes."""
     bounds = [*np.flatnonzero(mark_changes(*columns)).tolist(), len(columns[0])]
     return [slice(start, stop) for start, stop in pairwise(bounds)]
 
@@ -119,10 +98,7 @@ def split_runs(*columns: NDArray[Any]) -> list[slice]:
 def take_rows(
     rows: NDArray[np.uint8], which: NDArray[np.intp] | NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
-    """Return copies of the rows of bytes that indices or a mask select, (k, size).
-
-    Each row is copied as one item, not byte by byte.
-    """
+    """Return copies of the rows of bytes that indices or a mask select, (k, size)."""
     whole = rows.view(f"V{rows.shape[1]}")[:, 0]
     if which.dtype != np.bool_ and rows.flags.c_contiguous:
         some = whole.take(which)
@@ -135,17 +111,12 @@ def take_rows(
 def keep_freed_memory() -> None:
     """Make the allocator keep freed blocks of up to 32 MiB.
 
-    It is called before the first large batch is decoded.
-
-    The columns of a batch are blocks of several hundred kilobytes, which are freed after
-    milliseconds. By default, glibc requests each such block from the system. The page faults of the
-    block take several times as long as computing the columns. glibc keeps blocks that are smaller
-    than the largest block that was ever freed. This function therefore allocates one large block
-    and frees it. The block is never written, so it takes no memory.
-
     Source: mallopt(3), M_MMAP_THRESHOLD: the threshold is adjusted dynamically, and
     M_TRIM_THRESHOLD to twice its value.
     """
+    # By default, glibc requests each column of a batch from the system, and the page faults take
+    # several times as long as computing the column. glibc keeps blocks that are smaller than the
+    # largest block that was ever freed. This block is never written, so it takes no memory.
     np.empty(LARGE_BLOCK_BYTES, np.uint8)
 
 

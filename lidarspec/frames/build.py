@@ -98,11 +98,7 @@ def _check_paths(values: Mapping[str, Any], root: Node, place: str) -> None:
 def _merge_values(
     value: Mapping[str, Any], values: Mapping[str, Any], place: str
 ) -> Mapping[str, Any]:
-    """Return the fields of `value`; fields in `values` override them.
-
-    Raises:
-        UsageError: if a path in `values` leads to an array element, but has no index.
-    """
+    """Return the fields of `value`; fields in `values` override them."""
     nested = {name: new for name, new in values.items() if not name.isidentifier()}
     merged: dict[str, Any] = {**value, **values}
     if not nested:
@@ -120,10 +116,7 @@ def _merge_values(
 
 
 class _ValueChecker:
-    """Checks the names and ranges of the caller's values, and converts them to raw values.
-
-    If the values are physical, their units are checked as well.
-    """
+    """Checks the names and ranges of the caller's values, and converts them to raw values."""
 
     def __init__(self, table: Schema, paths: frozenset[str], place: str, *, units: bool) -> None:
         self._table = table
@@ -168,11 +161,7 @@ class _ValueChecker:
         return checked
 
     def _to_bytes(self, numbers: list[Any], shown: str) -> bytes | list[Any]:
-        """Return a list of numbers as bytes; return a list of other values unchanged.
-
-        Raises:
-            UsageError: for a number that is not an integer from 0 to 255.
-        """
+        """Return a list of numbers as bytes; return a list of other values unchanged."""
         if not any(isinstance(part, int | str) for part in numbers):
             return numbers
         try:

@@ -39,9 +39,7 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
     """Return the bytes of a command; b"" for a command that only sets control lines.
 
     Args:
-        arguments: the arguments by name, in the units of their fields. The mapping may also contain
-            values of a template, by name, and values that are known only when the command is sent,
-            by the path of the field.
+        arguments: the arguments by name, in the units of their fields.
 
     Raises:
         UnknownCommand: if the sensor has no such command.
@@ -94,11 +92,7 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
 
 
 def _fill_template(template: Template, arguments: Mapping[str, Any], place: str) -> bytes:
-    """Return the text of a template; missing values are 0.
-
-    Raises:
-        UsageError: for a value that a template does not accept.
-    """
+    """Return the text of a template; missing values are 0."""
     given = {name: arguments.get(name, 0) for name in template.names}
     try:
         return template.fill(given)
@@ -275,11 +269,7 @@ def has_only_names(kind: Range, choices: Mapping[str, float]) -> bool:
 
 
 def _find_named(info: FieldInfo, kind: Range, name: str, place: str) -> float:
-    """Return the physical value of a name.
-
-    Raises:
-        UsageError: if the argument does not accept the name.
-    """
+    """Return the physical value that a name of the argument stands for."""
     choices = list_choices(info, kind)
     if name not in choices:
         raise UsageError(f"{place} must be {' or '.join(choices) or 'a number'}, not {name!r:.60}")
@@ -287,10 +277,7 @@ def _find_named(info: FieldInfo, kind: Range, name: str, place: str) -> float:
 
 
 def _to_raw_value(slot: ArgumentSlot, data: bytes) -> Any:
-    """Convert bytes to the raw value of a field.
-
-    The field is plain bytes, an array of numbers, or one number in network byte order.
-    """
+    """Convert bytes to the raw value of a field."""
     if slot.info.kind == "bytes":
         return data
     if slot.is_array:
@@ -301,10 +288,7 @@ def _to_raw_value(slot: ArgumentSlot, data: bytes) -> Any:
 def _resolve_filled(
     sensor: SensorDescription, name: str, path: str, value: Count | Address | Port, given: Any
 ) -> Any:
-    """Return the raw value of a field that is filled in when a command is sent.
-
-    If the caller gives no value, the result is the first number of a `Count`, or zero bytes.
-    """
+    """Return the raw value of a field that is filled in when a command is sent."""
     if isinstance(value, Count):
         if given is None:
             return value.first

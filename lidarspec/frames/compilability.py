@@ -1,7 +1,7 @@
 """Check which structs can be compiled.
 
-A struct cannot be compiled if it has a part whose offset does not follow from header fields. Frames
-of such a struct are parsed by construct.
+A struct cannot be compiled if the offset of a part does not follow from header fields. construct
+parses the frames of such a struct.
 """
 
 from __future__ import annotations
@@ -11,10 +11,7 @@ from lidarspec.spec import tree
 
 
 class NotCompilableError(Exception):
-    """The offset of a part of a struct cannot be computed.
-
-    `path` is the path of the part, and `reason` is a text.
-    """
+    """The offset of a part of a struct cannot be computed."""
 
     def __init__(self, path: str, reason: str) -> None:
         self.path = path
@@ -23,11 +20,7 @@ class NotCompilableError(Exception):
 
 
 def check_compilable(root: tree.Node) -> None:
-    """Raise `NotCompilableError` if the frames of a tree cannot have layouts.
-
-    This is the case if the offset of a part cannot be computed, or if no column can represent the
-    values of a field.
-    """
+    """Raise `NotCompilableError` if the frames of a tree cannot have layouts."""
     _check(root, "", is_in_array=False)
     _check_columns(root)
 
@@ -75,13 +68,8 @@ def _check(node: tree.Node, path: str, *, is_in_array: bool) -> None:
 
 
 def _check_alternatives(node: tree.When | tree.Select) -> None:
-    """Check that alternatives do not share the name of a part of measured size.
-
-    `build` finds the value of such a part by its name, before it selects an alternative.
-
-    Raises:
-        NotCompilableError: if another alternative has a field with the same name.
-    """
+    """Check that alternatives do not share the name of a part of measured size."""
+    # `build` finds the value of such a part by its name, before it selects an alternative.
     alternatives = tree.children(node)
     for alternative in alternatives:
         others = [other for other in alternatives if other is not alternative]

@@ -1,8 +1,6 @@
 """Find the first fault in the bytes of one frame.
 
-Faults are ordered by the offset up to which the frame has to be read. For a wrong constant or
-value, this is the end of the field. For a wrong length or checksum, this is the end of the struct.
-Missing or additional bytes come last.
+The first fault is the fault that can be found with the fewest bytes of the frame.
 """
 
 from __future__ import annotations
@@ -46,8 +44,7 @@ class Fault:
         offset: the offset of the first byte of the field in the frame.
         expected: the expected value, as a text or number.
         got: the actual value, as a text or number.
-        end: the offset up to which the frame has to be read to find the fault. Faults are ordered
-            by it.
+        end: the offset up to which the frame has to be read to find the fault.
         needed: the size of a field that is cut off, in bytes; 0 for all other faults.
         is_bounded: whether the field is cut off by the end of the parts, not by the end of the
             frame.
@@ -66,7 +63,7 @@ class Fault:
         """Return a description of the fault.
 
         Args:
-            offset: the offset to print, which differs from `self.offset` if the frame is encoded.
+            offset: the offset to print.
         """
         if self.kind == CUT_OFF:
             return self._describe_shortage()
@@ -97,11 +94,7 @@ class Fault:
 
 
 def find_fault(examined: ExaminedFrame) -> Fault | None:
-    """Return the first fault of a frame; None if it is valid.
-
-    Raises:
-        Exception: any error of an expression or a checksum of the plugin.
-    """
+    """Return the first fault of a frame; None if it is valid."""
     faults = [*_iter_faults(examined)]
     layout = examined.layout
     if layout is not None and layout.size < len(examined.data):
@@ -111,11 +104,7 @@ def find_fault(examined: ExaminedFrame) -> Fault | None:
 
 
 def find_shortage(examined: ExaminedFrame) -> Fault | None:
-    """Return the fault that prevents parsing of a frame; None if it can be parsed.
-
-    Raises:
-        Exception: any error of an expression of the struct.
-    """
+    """Return the fault that prevents parsing of a frame; None if it can be parsed."""
     cut_off = next((each for each in examined.fields() if each.raw is None), None)
     if examined.layout is None or cut_off is not None:
         return _find_end_fault(examined, cut_off)
@@ -250,11 +239,7 @@ def _insert_indices(path: str, axes: Sequence[str], indices: Sequence[int]) -> s
 
 
 def _find_end_fault(examined: ExaminedFrame, cut_off: WireField | None) -> Fault:
-    """Return the fault of a truncated frame, or of a header without a layout.
-
-    Raises:
-        Exception: any error of an expression of the struct.
-    """
+    """Return the fault of a truncated frame, or of a header without a layout."""
     part = _find_open_part(examined)
     if part is not None and part.failure is not None:
         return _find_end_fault(part, cut_off)

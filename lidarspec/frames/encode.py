@@ -1,9 +1,7 @@
 """Encode one frame from the values of its fields, by its layout.
 
-First, each count field is set to the length of its array or parts. The values of the header fields
-then select the layout, and each value is stored at its offset. Lengths, constants and checksums are
-written last. A part of a frame (`PartSequence`) is encoded as a frame of its own, and copied into
-the outer frame.
+The values of the header fields select the layout, and each value is stored at its offset. Lengths,
+constants and checksums are written last.
 """
 
 from __future__ import annotations
@@ -129,11 +127,7 @@ class _Encoder:
         return row.tobytes()
 
     def _measure_texts(self) -> None:
-        """Find the sizes of the texts that end at a mark.
-
-        Raises:
-            UsageError: for a value that is not bytes, or that contains the end mark.
-        """
+        """Find the sizes of the texts that end at a mark."""
         for path, ending in self._schema.endings.items():
             info = self._schema.fields[path]
             shown = self._make_shown_path(path)
@@ -441,11 +435,7 @@ class _Encoder:
     def _check(
         self, layout: Layout, row: NDArray[np.uint8], parts: Mapping[str, list[bytes]]
     ) -> None:
-        """Check that the parts agree with the header, and that all conditions are true.
-
-        Raises:
-            UsageError: if the check fails.
-        """
+        """Check that the parts agree with the header, and that all conditions are true."""
         for axis, region in layout.regions.items():
             count = region.rule.count
             if count is not None and count != len(parts[axis]):
@@ -488,11 +478,7 @@ class _Encoder:
 
 
 def to_raw(info: FieldInfo, value: Any) -> Any:
-    """Return the raw value of a field.
-
-    The name of an Enum is converted to its number. If the field is an integer, a single byte is
-    converted to an integer.
-    """
+    """Return the raw value of a field."""
     if info.adapter is not None and info.kind == "int" and value is not None:
         return info.adapter.encode(value, 0)
     if isinstance(value, str):
@@ -503,10 +489,7 @@ def to_raw(info: FieldInfo, value: Any) -> Any:
 
 
 def fill_counts(given: Container, table: Schema) -> None:
-    """Set the header fields that contain the lengths of arrays.
-
-    Given values are kept, except for fields that are always computed from the array.
-    """
+    """Set the header fields that contain the lengths of arrays."""
     counted = set[str]()
     for axis, count in table.arrays.items():
         array = get_member(given, axis, None)
@@ -546,7 +529,6 @@ def set_count(
     A field that already has a value is not changed.
 
     Args:
-        value: the value of the formula.
         axis: the path of the array or of the parts, for messages.
     """
     if formula is None:
@@ -561,10 +543,7 @@ def set_count(
 
 
 def _find_holder(values: Any, path: str) -> tuple[Any, str]:
-    """Return the mapping that contains a field, and the name of the field in it.
-
-    Missing mappings are added to `values`.
-    """
+    """Return the mapping that contains a field, and the name of the field in it."""
     *parents, last = path.split(".")
     for parent in parents:
         values = values.setdefault(parent, Container())
@@ -580,18 +559,7 @@ def _find_count(
     info: FieldInfo,
     axis: str,
 ) -> int:
-    """Find the value of a count field with which a formula results in `length`.
-
-    Args:
-        count: the formula.
-        holder: the mapping with the count field, which is updated.
-        field: the name of the field in `holder`.
-        length: the result that the formula must have.
-        axis: the path of the array, for the error message.
-
-    Raises:
-        UsageError: if no value results in the length.
-    """
+    """Return the value of a count field for which the formula results in `length`."""
     if info.kind == "int":
         top = int(info.limits[1])
     else:
@@ -616,12 +584,12 @@ def _find_count(
 
 
 def find_kind(node: PartSequence, part: Mapping[str, Any]) -> Kind:
-    """Return the kind of a part, given its values.
+    """Return the kind of part that fits the given values best.
 
-    A kind fits if it has all given fields, and if the given values agree with its constants. Of the
-    kinds that fit, the one with the fewest missing values is returned. If no kind fits, the first
-    kind is returned.
+    The first kind is returned if no kind fits.
     """
+    # A kind fits if it has all given fields, and if the given values agree with its constants. Of
+    # the kinds that fit, the one with the fewest missing values is the best.
     possible = list[tuple[int, Kind]]()
     for kind in node.kinds:
         fields = make_schema(kind.root)

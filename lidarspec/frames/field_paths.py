@@ -37,7 +37,6 @@ def put_value(
     Args:
         target: the struct or array; None to make a new one.
         path: the path. The index "*" sets the field in all elements.
-        value: the value.
         length: a function that returns the number of elements of the array at a path, 0 if unknown.
     """
     if not path:

@@ -1,11 +1,8 @@
 """Tables: frames of one type as columns of raw values, in stream order.
 
-There are two kinds of tables with the same interface. `CompiledTable` loads fields from bytes by
-their layout. `ParsedTable` collects fields from Containers that construct has parsed. Arrays of
-variable length are padded with zeros to the longest one; `counts` returns their lengths.
-
-Parts (frames within a frame) are in a table of their own, without padding. `parts` also returns the
-row of the frame that contains each part.
+`CompiledTable` loads fields from the bytes of frames. `ParsedTable` collects fields that construct
+has parsed. Arrays of variable length are padded with zeros; `counts` returns their lengths. Parts
+(frames within a frame) have a table of their own.
 """
 
 from __future__ import annotations
@@ -135,10 +132,7 @@ class CompiledTable:
         return column
 
     def _load(self, leaf: Leaf | Derivation, path: str, group: LayoutRows) -> NDArray[Any]:
-        """Return the values of a field in the frames of a group.
-
-        A path with an index selects one element, and the result has no axis for this array.
-        """
+        """Return the values of a field in the frames of a group."""
         values = group.layout.load(path, group.rows)
         if "[" in path:
             axes = self.schema.columns[without_indices(path)[0]].axes
@@ -186,7 +180,7 @@ class CompiledTable:
         return max((group.layout.lengths.get(axis, 0) for group in self.groups), default=0)
 
     def _get_elements(self, axis: str) -> _Elements:
-        """Return the elements of an array as `_Elements`. The result is cached."""
+        """Return the elements of an array as `_Elements`."""
         if axis not in self._arrays:
             table, owners = self.parts(axis)
             counts = np.bincount(owners, minlength=len(self)).astype(np.intp)
@@ -211,9 +205,7 @@ class CompiledTable:
     def _find_present_elements(self, axis: str, path: str) -> NDArray[np.bool_]:
         """Return where a field exists in an array with elements of different sizes.
 
-        The result has a value for each frame, (n,). If some elements of a frame have the field and
-        others do not, the result has a value for each element, (n, *lengths). A frame with an empty
-        array counts as having the field.
+        The shape is (n,), or (n, *lengths) if some elements of a frame lack the field.
         """
         base, indices = without_indices(path)
         if indices:
@@ -243,12 +235,7 @@ class CompiledTable:
         return column
 
     def _count_elements(self, axis: str, path: str) -> NDArray[np.intp]:
-        """Return the length of an array in each frame, (n,).
-
-        Args:
-            axis: the path of an array with elements of different sizes.
-            path: the path of the same array, or of an array in its elements.
-        """
+        """Return the length of the array at `path` in each frame, (n,)."""
         elements = self._get_elements(axis)
         if path == axis:
             return elements.counts
@@ -303,8 +290,6 @@ class CompiledTable:
 
     def find_parts(self, axis: str) -> list[tuple[LayoutRows, NDArray[np.uint8], FoundParts]]:
         """Find the parts at a path in all frames.
-
-        The result is cached, because the clock, the points and each kind of parts use it.
 
         Returns:
             A tuple for each group of frames that has parts: the group, the buffer that contains
@@ -393,7 +378,7 @@ class _Elements:
 
 @dataclass(frozen=True, eq=False)
 class _PartRows:
-    """Parts of one layout that one round of the search has found.
+    """Parts of one layout, in any frames.
 
     Attributes:
         layout: the layout of the parts.
@@ -414,7 +399,6 @@ def _group_by_layout(
     """Group parts by layout.
 
     Args:
-        pieces: the parts that the search has found.
         ranks: for each piece, the indices of its parts in the table of all parts.
     """
     members: dict[int, dict[int, list[tuple[_PartRows, NDArray[np.intp]]]]] = {}
@@ -432,8 +416,7 @@ def _gather_parts(parts: Sequence[tuple[_PartRows, NDArray[np.intp]]]) -> Layout
     """Return parts in stream order as `LayoutRows`.
 
     Args:
-        parts: pairs of parts and the indices of these parts in the table. All parts have one layout
-            and one buffer.
+        parts: pairs of parts and the indices of these parts in the table.
     """
     where = np.concatenate([own for _, own in parts])
     offsets = np.concatenate([piece.offsets for piece, _ in parts])
@@ -499,10 +482,7 @@ def is_ascending(where: NDArray[np.intp]) -> bool:
 
 
 class ParsedTable:
-    """A `Table` of frames that construct parsed.
-
-    It is used for structs that do not compile, and as the second engine in tests.
-    """
+    """A `Table` of frames that construct has parsed."""
 
     def __init__(self, schema: Schema, parsed: Sequence[Any], frames: Sequence[bytes]) -> None:
         self.schema = schema
@@ -629,7 +609,7 @@ def _take_element(
     Args:
         column: the values of the whole field, (n, *lengths).
         path: the path of the field, without indices.
-        indices: the index in each axis that is removed. A negative index counts from the end.
+        indices: the index of the element, by the path of the array.
     """
     inside = np.ones(len(table), np.bool_)
     axes = table.schema.columns[path].axes
@@ -668,14 +648,7 @@ def _has_element(table: Table, path: str, indices: Mapping[str, int]) -> NDArray
 
 
 def _collect_values(parsed: Any, names: list[str], axes: int) -> Any:
-    """Return the value at a path of a parsed frame; None if the frame lacks it.
-
-    A value in arrays is returned as nested lists.
-
-    Args:
-        names: the names that lead to the value.
-        axes: the number of arrays that contain the value.
-    """
+    """Return the value at a path of a parsed frame; None if the frame lacks it."""
     if isinstance(parsed, list):
         return _collect_elements(parsed, names, axes)
     for index, name in enumerate(names):
@@ -699,10 +672,7 @@ def _collect_elements(parsed: list[Any], names: list[str], axes: int) -> list[An
 
 
 def _find_present(value: Any) -> Any:
-    """Return whether a value is not None.
-
-    For nested lists, the result is True if no element is None, else nested lists of booleans.
-    """
+    """Return whether a value, or each element of nested lists, is not None."""
     if not isinstance(value, list):
         return value is not None
     present = [_find_present(part) for part in value]
@@ -712,10 +682,7 @@ def _find_present(value: Any) -> Any:
 
 
 def _copy_value(column: NDArray[Any], index: int, value: Any) -> None:
-    """Copy a value or nested lists to an index of a padded array.
-
-    If a list is shorter than the array, the remaining elements of the array are not changed.
-    """
+    """Copy a value or nested lists to an index of a padded array."""
     if isinstance(value, list) and column.ndim > 2:
         for place, part in enumerate(value):
             _copy_value(column[index], place, part)
@@ -728,14 +695,7 @@ def _copy_value(column: NDArray[Any], index: int, value: Any) -> None:
 
 
 def _collect_lengths(value: Any, names: list[str], brackets: int) -> set[int]:
-    """Return all lengths that an array has in one parsed frame.
-
-    An array inside another array may have several lengths.
-
-    Args:
-        names: the names that lead to the array.
-        brackets: the number of arrays that directly contain this array ("[]" in its axis).
-    """
+    """Return all lengths that an array has in one parsed frame."""
     if isinstance(value, list) and (names or brackets):
         below = brackets if names else brackets - 1
         return {length for part in value for length in _collect_lengths(part, names, below)}
@@ -762,10 +722,7 @@ def _iter_numbers(value: Any) -> Iterator[Any]:
 
 
 def _are_numbers(found: list[Any]) -> bool:
-    """Return whether all values are numbers that fit into 64 bits.
-
-    Nested lists of numbers are accepted as well.
-    """
+    """Return whether all values are numbers that fit into 64 bits."""
     values = list(_iter_numbers(found))
     if not all(isinstance(value, int | float) for value in values):
         return False
@@ -778,10 +735,7 @@ def _are_numbers(found: list[Any]) -> bool:
 
 
 def _find_outer_shape(leaf: Leaf | Derivation) -> tuple[int, ...]:
-    """Return the lengths of the arrays that contain a field.
-
-    A field of bytes with an adapter is one value, so its axis of bytes is left out.
-    """
+    """Return the lengths of the arrays that contain a field."""
     if leaf.info.adapter is not None and leaf.info.kind == "bytes":
         return leaf.shape[:-1]
     return leaf.shape

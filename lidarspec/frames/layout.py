@@ -1,11 +1,8 @@
 """Layouts: the positions of all fields of a frame, for loading and storing values.
 
-A `Layout` describes the frames of one header variant by offsets, strides, bits, constants and
-checksums. `lidarspec.frames.layout_tree` makes it from the frame tree. A `Leaf` is the position of
-one field. A `Seal` is a checksum with the bytes that it covers.
-
-Most functions handle many frames at once, given as rows of bytes. Constants are compared in words
-of up to eight bytes.
+A `Layout` describes the frames of one header variant. `lidarspec.frames.layout_tree` makes it from
+the frame tree. A `Leaf` is the position of one field. A `Seal` is a checksum with the bytes that it
+covers. Most functions handle many frames at once, given as rows of bytes.
 """
 
 from __future__ import annotations
@@ -73,11 +70,10 @@ def gather_rows(
 ) -> NDArray[np.uint8]:
     """Return rows of `size` bytes, one for each start offset, (n, size).
 
-    Nothing is copied if each row follows the previous one in the buffer.
+    The result may be a view of the buffer.
 
     Args:
-        gathered: whether the result has to be C-contiguous. If not, rows at evenly spaced offsets
-            are not copied either.
+        gathered: whether the result has to be C-contiguous.
     """
     count = len(offsets)
     if not count or not size:
@@ -111,8 +107,7 @@ class Leaf:
         strides: the distance from one element to the next along each array, in bytes. An array
             inside a bit block has no stride.
         wire: the dtype with byte order if NumPy can read the field directly, else None.
-        elements: the bits of the field if `wire` is None. For an array inside a bit block, the bits
-            of each element of the array.
+        elements: the bits of each element if `wire` is None.
         size: the size of one element, or of the bit block that contains the field, in bytes.
     """
 
@@ -125,10 +120,10 @@ class Leaf:
     elements: tuple[BitField, ...] = ()
 
     def load(self, rows: Bytes2D) -> NDArray[Any]:
-        """Return the raw values of the field in each frame, given the frames as rows.
+        """Return the raw values of the field, (n, *shape), in native byte order.
 
-        Returns:
-            An array (n, *shape) in native byte order.
+        Args:
+            rows: the frames, (n, size).
         """
         if self.wire is not None:
             return self._view(rows, self.wire, 0).astype(self._native)
@@ -154,7 +149,9 @@ class Leaf:
         offsets: NDArray[np.intp],
         stops: NDArray[np.intp] | None = None,
     ) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
-        """Read an integer field outside arrays in the candidates at these offsets.
+        """Read an integer field in the candidates at these offsets.
+
+        The field must not be in an array.
 
         Args:
             stops: the offset after the last byte of each candidate; by default the end of the
@@ -199,8 +196,8 @@ class Leaf:
         """Return the offset of each element, row by row.
 
         Args:
-            depth: how many of the outer arrays to iterate over; by default all arrays outside a bit
-                block.
+            depth: the number of outer arrays to iterate over; None for all arrays outside a
+                bit block.
         """
         offsets = [self.offset]
         for length, stride in list(zip(self.shape, self.strides, strict=False))[:depth]:
@@ -208,11 +205,7 @@ class Leaf:
         return offsets
 
     def raw(self, given: Sequence[Any]) -> NDArray[Any]:
-        """Return physical values of n frames as raw values, (n, ...).
-
-        Axes of length 1 are appended to values with fewer axes than the field. Bytes are padded
-        with zeros.
-        """
+        """Return physical values of n frames as raw values, (n, ...)."""
         if self.info.kind == "bytes":
             size = self.shape[-1]
             given = [
@@ -277,12 +270,7 @@ class Leaf:
     def _read_contiguous_bits(
         self, rows: Bytes2D, element: BitField, wide: np.dtype[Any]
     ) -> NDArray[Any] | None:
-        """Return the values of contiguous bits.
-
-        Each value is read as one word, which ends with the last byte of the value. Returns None if
-        the bits are not contiguous, if the value does not fit into a word, or if the word would
-        begin before the frame.
-        """
+        """Return the values of contiguous bits; None if they cannot be read as words."""
         if element.run is None:
             return None
         order, first, count, lowest = element.run
@@ -313,8 +301,7 @@ class Leaf:
     def element(self, path: str, indices: Mapping[str, int]) -> Leaf | None:
         """Return one element of the arrays of the field; None if it does not exist.
 
-        A negative index counts from the end. If an outer array has an index and an inner array has
-        none, the axis of the outer array is kept, with length 1.
+        A negative index counts from the end.
         """
         info = get_element(self.info, path, indices)
         if info is None:
@@ -467,8 +454,8 @@ class Seal:
         """Compute the checksums of the frames, (n,).
 
         Args:
-            sums: a faster function that computes the checksums. If it is None or returns None, the
-                algorithm of the seal is used.
+            sums: a faster function; the algorithm of the seal is used if it is None or returns
+                None.
         """
         values = None if sums is None else sums(self, rows)
         if values is None:
@@ -516,9 +503,6 @@ class Seal:
         """Return whether the checksum of each frame is correct, (n,).
 
         A stored value in `absent` counts as correct.
-
-        Args:
-            sums: a faster function that computes the checksums, see `compute`.
         """
         stored = self.load_stored(rows)
         if self.absent:
@@ -551,10 +535,7 @@ class Condition:
     @classmethod
     @lru_cache(maxsize=4096)
     def of(cls, what: FieldInfo | Check) -> Condition:
-        """Return the condition of a check, or of the allowed values of a field.
-
-        The result is cached, so that all layouts share one object.
-        """
+        """Return the condition of a check, or of the allowed values of a field."""
         if isinstance(what, FieldInfo):
             return cls((what,), None, what.path)
         fields = tuple(ref.info for ref in refs(what.condition))
@@ -600,18 +581,13 @@ class FrameTest(Protocol):
         """The fields that the test reads."""
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-        """Return whether the test is true, element by element.
-
-        Args:
-            raw: the raw values of the fields, by path. Fields that a layout does not have are
-                missing.
-        """
+        """Return whether the test is true, element by element."""
 
 
 def find_passing(test: FrameTest, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
     """Return whether each frame, given as a row of bytes, passes a test, (n,).
 
-    A frame passes if the test is true for all elements of the tested arrays.
+    In a frame with arrays, the test must be true for all elements.
     """
     raw = {
         info.path: leaf.load(rows)
@@ -627,12 +603,12 @@ def find_passing(test: FrameTest, leaves: Mapping[str, Leaf], rows: Bytes2D) -> 
 class LayoutRefusal:
     """The reason why frames with a certain header have no layout.
 
+    Without an `error` or a wrong constant, the frame is too long.
+
     Attributes:
         error: the error of a plugin expression that failed.
-        has_wrong_constant: whether a constant is wrong. If this is False and `error` is None, the
-            frame is too long.
+        has_wrong_constant: whether a constant is wrong.
         constants: if the frame is too long, the constants before the part that is too long.
-            A candidate in which one of these constants is wrong gets the status `CONSTANT`.
     """
 
     error: PluginError | None = None
@@ -651,8 +627,7 @@ class Layout:
         seals: the checksums, inner checksums first.
         places: the byte range of each named part outside arrays.
         branches: the branch that each `When` and `Select` takes.
-        following: the fields whose values follow from the header, each with its value. The values
-            are written when a frame is built, and not checked when a frame is parsed.
+        following: the fields whose values follow from the header, each with its value.
         lengths: the length of each array, by path; 0 for an array inside an empty array.
         regions: the `Region` of each sequence of parts (frames within the frame), by path.
         held: the bits of the fields that declare the sizes of parts, as (mask, value) by offset.
@@ -678,10 +653,7 @@ class Layout:
 
     @cached_property
     def known(self) -> Mapping[int, tuple[int, int]]:
-        """The bits in `constants` and in `held`, as (mask, value) by offset.
-
-        These bits are the same in all frames of this layout.
-        """
+        """The bits in `constants` and in `held`, as (mask, value) by offset."""
         both = dict(self.constants)
         for offset, (mask, value) in self.held.items():
             other = both.get(offset, (0, 0))
@@ -773,20 +745,14 @@ Word = tuple[int, np.dtype[Any], Any, Any]
 
 
 def sort_constants(constants: Mapping[int, tuple[int, int]]) -> Marks:
-    """Return constant bytes in a list, whole bytes before single bits.
-
-    Both groups are sorted by offset. Whole bytes come first because they exclude more candidates.
-    """
+    """Return constant bytes in a list, whole bytes before single bits."""
     constant_bytes = [(offset, mask, value) for offset, (mask, value) in constants.items()]
     return tuple(sorted(constant_bytes, key=lambda mark: (mark[1] != 0xFF, mark[0])))
 
 
 @lru_cache(maxsize=2048)
 def merge_constants(constants: Marks) -> tuple[Word, ...]:
-    """Merge constant bytes into words of 1, 2, 4 or 8 bytes.
-
-    The first and the last byte of each word have constant bits.
-    """
+    """Merge constant bytes into words of 1, 2, 4 or 8 bytes."""
     left = {offset: (mask, value) for offset, mask, value in constants}
     merged = list[Word]()
     while left:
@@ -815,10 +781,7 @@ def are_contradictory(some: Marks, others: Marks) -> bool:
 
 
 def match_word(values: NDArray[Any], word: Word) -> NDArray[np.bool_]:
-    """Return whether each value matches a constant word.
-
-    The values were read at the offset of the word.
-    """
+    """Return whether each value matches a constant word."""
     _, _, mask, value = word
     return np.asarray((values if mask is None else values & mask) == value)
 

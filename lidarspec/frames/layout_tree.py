@@ -1,13 +1,11 @@
 """Compute the layouts of a frame type: the offset of each field, for each variant of the header.
 
-If a struct has a count, condition or key, the layout depends on header fields, which are called
-*selectors* here. `find_layout` moves a cursor through the tree of the struct, for given values of
-the selectors. If it needs another selector, it raises `UnknownSelectorError`.
+A layout may depend on header fields, such as a count. These fields are called *selectors* here.
+`find_layout` returns the layout for given values of the selectors.
 
-`HeaderTree` is a decision tree that caches the results. Each inner node is a selector, each branch
-is a value of the selector, and each leaf is a `Layout`, or a `LayoutRefusal` with the reason why
-there is no layout. `HeaderTree.classify` passes many candidates through the tree at once, so that
-`find_layout` runs only once for each distinct header.
+`HeaderTree` is a decision tree that caches layouts. An inner node is a selector, a branch is a
+value of the selector, and a leaf is a `Layout`, or a `LayoutRefusal` with the reason why there is
+no layout.
 """
 
 from __future__ import annotations
@@ -94,12 +92,7 @@ def find_layout(
 
 
 def walk_layout(walk: HeaderWalk, root: tree.Node) -> Layout:
-    """Complete a walk through the tree, and return the layout.
-
-    Raises:
-        Exception: the same as `find_layout`, or any error of `walk.request`. The walk then has the
-            results up to the error.
-    """
+    """Complete a walk through the tree, and return the layout."""
     walk.visit(root, "")
     if not walk.cursor:
         raise TooLongError("")
@@ -128,10 +121,7 @@ ValueRequest = Callable[[Leaf | MeasuredSize, "HeaderWalk"], int]
 
 @dataclass
 class HeaderWalk:
-    """A walk through the tree of a frame type, for given values of header fields.
-
-    The attributes from `cursor` on are the results.
-    """
+    """A walk through the tree of a frame type, for given values of header fields."""
 
     values: Mapping[str, int]
     limit: int
@@ -184,9 +174,7 @@ class HeaderWalk:
         return Layout(*found, held, tuple(self.conditions.values()), derived)
 
     def read(self, path: str) -> int | None:
-        """Return the raw value of a field for a formula.
-
-        Returns None if frames with this header do not have the field.
+        """Return the raw value of a field; None if frames with this header lack it.
 
         Raises:
             UnknownSelectorError: if the walk does not have the value of the field.
@@ -223,8 +211,6 @@ class HeaderWalk:
         """Add a part and move the cursor to its end.
 
         Args:
-            node: the part.
-            path: the path of the part.
             shape: the lengths of the arrays that contain the part.
             strides: the strides of these arrays.
         """
@@ -322,10 +308,7 @@ class HeaderWalk:
     def _add_peeked_fields(
         self, node: tree.Derived, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
-        """Add fields at the cursor, and leave the cursor at this place.
-
-        The bytes of these fields belong to the following nodes.
-        """
+        """Add fields at the cursor without moving the cursor."""
         start = self.cursor
         leaves = self.leaves
         self.leaves = {}
@@ -336,10 +319,7 @@ class HeaderWalk:
         self.cursor = start
 
     def _add_parts(self, node: tree.PartSequence, path: str) -> None:
-        """Add a sequence of parts.
-
-        If no header field contains the total size of the parts, `request` has to return it.
-        """
+        """Add a sequence of parts."""
         given = {ref.path: int(self._evaluate(ref) or 0) for ref in node.outer}
         rule = PartRule(
             *(
@@ -484,8 +464,6 @@ class HeaderWalk:
     def _find_size_bits(self) -> dict[int, tuple[int, int]]:
         """Return the bits of the fields that contain the sizes of parts.
 
-        All frames of one layout have the same values in these fields.
-
         Returns:
             A mask and the value of the masked bits, by byte offset.
         """
@@ -540,11 +518,7 @@ def _set_stride(leaves: dict[str, Any], axis: str, depth: int, size: int) -> Non
 
 
 def _order_seals(seals: list[Seal]) -> Iterator[Seal]:
-    """Yield checksums in the order in which they can be computed.
-
-    A checksum comes after all checksums whose fields it covers. Otherwise, inner checksums come
-    before outer checksums.
-    """
+    """Yield checksums in the order in which they can be computed."""
     left = list(seals)
     while left:
         free = (
@@ -574,8 +548,7 @@ class HeaderNode:
         above: the parent node; None for the root.
         leaf: the selector of this node; None if it is not known yet, or if the node has a result.
         before: all fields before `leaf`, by path.
-        constants: the constants before `leaf`, or before the end of a truncated frame. Constants
-            that all frames begin with are left out.
+        constants: the constants before `leaf`, or before the end of a truncated frame.
         least: the known minimum size of a frame with these values, in bytes; 0 if not known.
         value_classes: the values of `leaf` that lead to different layouts.
         children: the child nodes by value of `leaf`.
@@ -614,35 +587,26 @@ Group = tuple[Layout | LayoutRefusal, NDArray[np.intp]]
 
 @dataclass(frozen=True)
 class _ValueClasses:
-    """Maps each value of a header field to a representative with the same result.
-
-    The result is a layout or a refusal. Random bytes in place of a header can contain billions of
-    different lengths or keys. The tree stays small, because it has a branch only for each
-    representative.
-
-    If `keys` is not empty, all values that are not in it are mapped to `other`. Otherwise, values
-    are limited to the interval from `low` to `high`.
+    """Maps each value of a header field to a value with the same layout.
 
     Attributes:
         limits: the lowest and the highest value of the field.
-        rises: above this value, a larger value never makes the frame shorter. None if no such value
-            is known.
+        rises: the value above which a larger value never makes the frame shorter; None if
+            unknown.
     """
 
+    # Random bytes in place of a header can contain billions of lengths or keys. The tree stays
+    # small, because it has one branch for all values with the same result.
     limits: tuple[int, int]
     low: int
     high: int
-    keys: frozenset[int] = frozenset()
+    keys: frozenset[int] = frozenset()  # if not empty, all other values are mapped to `other`
     other: int = 0
     rises: int | None = None
 
     @classmethod
     def of(cls, info: tree.FieldInfo, root: tree.Node, limit: int) -> _ValueClasses:
-        """Group the values of a header field by their effect on the layout.
-
-        The formulas of the frame determine this effect. If they are too complicated, no values are
-        grouped.
-        """
+        """Group the values of a header field by their effect on the layout."""
         (low, high), nodes = info.limits, list(tree.nodes(root))
         asking = [
             (node, formula)
@@ -697,11 +661,7 @@ class _ValueClasses:
         return cls(info.limits, low, high)
 
     def limit_to(self, value: int) -> _ValueClasses:
-        """Return classes that map all larger values to `value`.
-
-        `value` makes the frame too long. If a larger value may make the frame shorter, the classes
-        are not changed.
-        """
+        """Limit the values to `value` if no larger value makes the frame shorter."""
         if self.rises is not None and self.rises <= value < self.high:
             return replace(self, high=value)
         return self
@@ -733,10 +693,7 @@ def _depends_on(formula: tree.Formula, info: tree.FieldInfo) -> bool:
 
 
 def _is_size_formula(node: tree.Node, formula: tree.Formula) -> bool:
-    """Return whether a formula of a node counts bytes, elements or parts.
-
-    The frame is refused if the result of such a formula is larger than the maximum frame size.
-    """
+    """Return whether a formula of a node counts bytes, elements or parts."""
     is_number = isinstance(node, tree.Repeat | tree.Blob) or (
         isinstance(node, tree.PartSequence) and formula is node.count
     )
@@ -760,8 +717,6 @@ def _evaluate_with(formula: tree.Formula, value: int) -> int:
 
 class _CandidateSet:
     """The candidates in a buffer that are passed to `HeaderTree.classify`.
-
-    Frames have at most `limit` bytes.
 
     Attributes:
         refuted: the indices of candidates that are incomplete or too long, and have a wrong
@@ -799,8 +754,6 @@ class _CandidateSet:
     ) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
         """Read the field of a node in the candidates that contain it.
 
-        If a candidate ends before the field and has a wrong constant, it is added to `refuted`.
-
         Returns:
             The indices of the candidates with the field (None for all candidates), and the values
             of the field.
@@ -814,10 +767,7 @@ class _CandidateSet:
         return there, values
 
     def add_refuted(self, node: HeaderNode, which: NDArray[np.intp]) -> None:
-        """Add the candidates with a wrong constant to `refuted`.
-
-        The constants are those of the node.
-        """
+        """Add the candidates with a wrong constant to `refuted`."""
         if node.constants:
             self.refuted.append(which[self.have_wrong_constants(node.constants, which)])
 
@@ -848,9 +798,6 @@ def _is_refuted(constants: Mapping[int, tuple[int, int]], data: bytes | memoryvi
 class HeaderTree:
     """All layouts of one frame type or kind of parts.
 
-    The layouts of parts also depend on fields of the outer frame. The argument `given` has the
-    values of these fields.
-
     Attributes:
         root: the frame type or kind of parts.
         limit: the maximum size of a frame, in bytes.
@@ -879,8 +826,7 @@ class HeaderTree:
         Candidates with an incomplete header are left out.
 
         Args:
-            stops: the offset after the last byte of each candidate, if all candidates are complete.
-                By default, candidates extend to the end of the buffer, and more bytes may follow.
+            stops: the offset after the last byte of each candidate; None if more bytes may follow.
 
         Returns:
             Pairs of a layout or refusal and the indices of its candidates.
@@ -905,7 +851,6 @@ class HeaderTree:
         """Group candidates by layout.
 
         Args:
-            number: the number of candidates.
             read: a function that reads the field of a node for some candidates.
             places: the bytes of the candidates; None if the bytes are available only to `read`.
         """
@@ -954,11 +899,7 @@ class HeaderTree:
         return tuple(leaves.values()), find_prefix(self.root, self.limit)
 
     def find_common_layout(self, rows: NDArray[np.uint8]) -> Layout | None:
-        """Return the common layout of rows of bytes; None if their layouts differ.
-
-        If rows have different values of a header field, the values must be equivalent
-        (`_ValueClasses`).
-        """
+        """Return the common layout of rows of bytes; None if their layouts differ."""
         node = self._root
         while node.result is None:
             if node.leaf is None:
@@ -988,7 +929,6 @@ class HeaderTree:
         If the bytes do not determine the layout, the node has no result.
 
         Args:
-            frame: the available bytes.
             since: the node that was returned for fewer bytes of this frame, to continue from.
             is_whole_frame: whether no bytes of the frame follow.
         """
@@ -1011,9 +951,6 @@ class HeaderTree:
 
         Args:
             read: a function that returns the value of a header field that the layout depends on.
-
-        Raises:
-            Exception: the same as `find_layout`, or any error of `read`.
         """
         self._limit_cache()
         node = self._root
@@ -1029,10 +966,7 @@ class HeaderTree:
     def _find_end(
         self, data: bytes | memoryview, node: HeaderNode, *, is_whole_frame: bool = False
     ) -> HeaderNode:
-        """Follow a header down the tree from a node, and return the last node.
-
-        Missing nodes are added, see `_explore`.
-        """
+        """Follow a header down the tree from a node, and return the last node."""
         while node.leaf is not None:
             value = node.leaf.read_first(data)
             if value is None:
@@ -1045,14 +979,7 @@ class HeaderTree:
     def _explore(
         self, node: HeaderNode, data: bytes | memoryview = b"", *, is_whole_frame: bool = False
     ) -> HeaderNode:
-        """Add the nodes for a header to the tree, as far as its bytes are available.
-
-        Args:
-            is_whole_frame: whether no bytes of the frame follow.
-
-        Returns:
-            The last node. If the bytes do not determine the layout, the node has no result.
-        """
+        """Add the nodes of a header to the tree, and return the last node."""
 
         def read_selector(leaf: Leaf | MeasuredSize, walk: HeaderWalk) -> int:
             nonlocal node
@@ -1104,10 +1031,7 @@ class HeaderTree:
         return node
 
     def _select_new_constants(self, walk: HeaderWalk) -> dict[int, tuple[int, int]]:
-        """Return the constants of a walk that the search has not checked.
-
-        The search has checked the constants that all frames begin with.
-        """
+        """Return the constants of a walk that the search has not checked."""
         return {
             offset: bits
             for offset, bits in walk.constants.items()

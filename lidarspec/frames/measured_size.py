@@ -1,7 +1,6 @@
 """Sizes that are found by reading the content of a frame, not its header.
 
-The layout of a frame depends on header fields and on these sizes. `MeasuredSize` therefore has the
-methods of a field. The sizes of sequences of parts are in `parts`.
+An example is the size of a text that ends at a mark.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ MAX_WINDOW_BYTES = 1 << 16
 class MeasuredSize(ABC):
     """A size that is found by reading the content of a frame.
 
-    The layout depends on it, so it has the methods of a header field (`Leaf`).
+    The class has the methods of a header field (`Leaf`).
 
     Attributes:
         info: the size as a field.
@@ -62,16 +61,14 @@ class MeasuredSize(ABC):
 
         Returns:
             The indices of the candidates in which the size was found (None for all candidates), and
-            the sizes. If the content cannot be valid, the size is the status of the frame with a
-            minus sign.
+            the sizes. For invalid content, the size is the status of the frame with a minus sign.
         """
 
     @abstractmethod
     def load(self, rows: Bytes2D) -> NDArray[Any]:
         """Return the size in each frame, given as a row of bytes, (n,).
 
-        If the content is incomplete or invalid, the size is the status of the frame with a minus
-        sign.
+        For invalid content, the size is the status of the frame with a minus sign.
         """
 
     def read_first(self, frame: bytes | memoryview) -> int | None:
@@ -167,7 +164,7 @@ class TextSize(MeasuredSize):
     def _find_sizes_together(
         self, buffer: NDArray[np.uint8], starts: Offsets, ends: Offsets
     ) -> NDArray[np.int64]:
-        """Return the result of `_find_sizes` for several texts, found by one search.
+        """Return the sizes of several texts, found by one search.
 
         The offsets of the texts must differ by multiples of the size of the end mark.
         """
@@ -181,10 +178,10 @@ class TextSize(MeasuredSize):
         return np.where(found + step <= ends, sizes, -1)
 
     def _match(self, units: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Return whether each unit is equal to the end mark, (...).
+        """Return whether each group of bytes is equal to the end mark, (...).
 
         Args:
-            units: groups of bytes, (..., size). A group has the size of the mark.
+            units: the groups, which have the size of the mark, (..., size).
         """
         mark = np.frombuffer(self.ending.mark, np.uint8)
         mask = np.frombuffer(self.ending.mask, np.uint8)

@@ -49,10 +49,7 @@ def find_number_format(info: FieldInfo) -> NumberFormat:
 
 @functools.lru_cache
 def _count_digits(scale: float, offset: float) -> int:
-    """Return the number of decimals that make all values of a field differ.
-
-    Up to `MAX_EXTRA_DIGITS` more decimals are used if each value is then exact.
-    """
+    """Return the number of decimals that make all values of a field differ."""
     steps = (to_exact(scale), to_exact(offset))
     distinguishing = next(
         (digits for digits in range(MAX_DIGITS) if abs(steps[0]) * 10**digits >= 1), MAX_DIGITS

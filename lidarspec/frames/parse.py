@@ -1,11 +1,7 @@
 """Parse one frame into a Container of raw values.
 
 A valid frame is read by its layout. For an invalid frame, a `WireError` with its first fault is
-raised.
-
-For each field, the values of all array elements are unpacked together. The containers and lists are
-then made from these values, innermost first (`unpack`). construct parses frames that have no layout
-(`lidarspec.frames.plain`).
+raised. construct parses frames that have no layout (`lidarspec.frames.plain`).
 """
 
 from __future__ import annotations
@@ -197,12 +193,7 @@ def _find_field_fault(
     examined: ExaminedFrame,
     to_wire_offset: Callable[[int], int],
 ) -> WireError:
-    """Return the first fault of the fields of a frame as an error.
-
-    Args:
-        to_wire_offset: a function that converts an offset in the struct to an offset in the encoded
-            frame.
-    """
+    """Return the first fault of a frame's fields as an error."""
     fault = _run_search(sensor, name, diagnose.find_fault, examined)
     if fault is None:  # a checksum of a plugin returned a different value this time
         return WireError("the frame is invalid", sensor=sensor.id, frame=name, data=data)
@@ -215,7 +206,7 @@ def _run_search(
     find: Callable[[ExaminedFrame], diagnose.Fault | None],
     examined: ExaminedFrame,
 ) -> diagnose.Fault | None:
-    """Return the fault that `find` finds.
+    """Return the fault that the search `find` returns; None without a fault.
 
     Raises:
         SpecError: if an expression or a checksum of the struct raises.
@@ -251,8 +242,7 @@ def _parse_unverified(sensor: SensorDescription, name: str, data: bytes) -> Any:
     """Return the values of a frame without verifying it.
 
     Raises:
-        WireError: if the frame is truncated, if its header has no layout, or if a value cannot be
-            decoded.
+        WireError: if a value cannot be read.
     """
     frame = sensor.frames[name]
     if isinstance(frame_layouts(frame), NotCompilableError):
@@ -304,7 +294,7 @@ Reader = Callable[[Any], Sequence[Any]]
 
 
 def _make_reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
-    """Return the reader of a part of the frames of one layout.
+    """Return the reader of a part, for frames of one layout.
 
     Args:
         count: the number of instances of the part in a frame.
@@ -421,7 +411,6 @@ def _make_unpacker(offsets: Sequence[int], order: str, code: str) -> Reader:
     """Return a reader of one value at each offset.
 
     Args:
-        offsets: the offsets in the frame, ascending.
         order: the byte order, as in `struct`.
         code: the format character, as in `struct`.
     """
@@ -503,11 +492,7 @@ def _look_up_labels(names: _LabelCache, numbers: Reader, frame: bytes) -> Sequen
 
 
 def _make_block_reader(node: Block, path: str, layout: Layout, count: int) -> Reader:
-    """Return a reader of bit blocks.
-
-    Each block is read as one number. The byte order is the one that splits the values into fewer
-    runs of bits.
-    """
+    """Return a reader of bit blocks."""
     leaf = _find_leaf(layout, ".".join(name for name in (path, *node.parts[0].names) if name))
     offsets = leaf.offsets()
     orders = [
@@ -541,8 +526,7 @@ def _find_bit_runs(
 ) -> list[tuple[int, int, int]]:
     """Return the runs of consecutive bits that make up a value in a bit block.
 
-    The block is read as one number. A run is (lowest bit in the block, mask, lowest bit in the
-    value).
+    A run is (lowest bit in the block, mask, lowest bit in the value).
     """
     runs = list[tuple[int, int, int]]()
     for segment in sorted(field.segments, key=lambda segment: segment.target):
@@ -563,10 +547,7 @@ def _find_bit_runs(
 
 
 def _make_bits_reader(field: BitField, runs: Sequence[tuple[int, int, int]]) -> Reader:
-    """Return a function that extracts one value from each of several bit blocks.
-
-    The function receives the blocks as integers.
-    """
+    """Return a function that extracts one value from each of several bit blocks."""
     low, mask, target = runs[0]
     if len(runs) > 1 or field.signed or field.flag or target:
         return functools.partial(_join_runs, field, runs)
@@ -627,10 +608,7 @@ def find_frame_layout(
 
 
 def _rank_fault(sensor: SensorDescription, fault: WireError) -> tuple[int, int]:
-    """Return a sort key, which is higher for a fault that is later in the frame.
-
-    Trailing bytes, and a wrong checksum of a complete frame, have the highest keys.
-    """
+    """Return a sort key, which is higher for a fault that is later in the frame."""
     if sensor.frames[fault.frame].wire is not None:
         return 0, fault.offset
     layout = find_frame_layout(sensor, fault.frame, fault.data)

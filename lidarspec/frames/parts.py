@@ -1,11 +1,7 @@
 """Find the parts of many frames (frames within a frame) at once.
 
-The offset of a part is known when the size of the previous part is known. The search therefore runs
-in rounds, and each round finds the next part of every frame. The kind of a part is found by its
-constants, and its layout by its header.
-
-The results are offsets in a buffer, as for frames. Parts therefore have layouts, rows and tables as
-frames do (`frame_table.Table.parts`).
+The search runs in rounds: each round finds the next part of every frame. The results are offsets in
+a buffer, as for frames.
 """
 
 from __future__ import annotations
@@ -48,10 +44,7 @@ ANY_SIZE = -1
 
 
 class LayoutLookup(Protocol):
-    """Finds the layouts of a frame type or of a kind of parts.
-
-    `HeaderTree` implements it.
-    """
+    """Finds the layouts of a frame type or of a kind of parts."""
 
     root: tree.Node
     limit: int
@@ -84,7 +77,6 @@ class PartKind:
     """A kind of parts.
 
     Attributes:
-        node: the kind in the frame tree.
         layouts: the layouts of its parts.
         prefix: the constants that all parts of this kind begin with, as (mask, value) by offset.
     """
@@ -123,7 +115,7 @@ class PartKind:
 
 @dataclass(frozen=True)
 class PartRule:
-    """The values of the formulas of a `tree.PartSequence` for one header.
+    """The number and the sizes of the parts, for one header.
 
     Attributes:
         count: the number of parts, or None.
@@ -193,11 +185,7 @@ class Region:
 
     @property
     def is_measured(self) -> bool:
-        """Whether the layout was found by measuring the size of its parts.
-
-        If so, all frames of this layout have complete parts, but checksums and conditions of the
-        parts may still be wrong.
-        """
+        """Whether the layout was found by measuring the size of its parts."""
         return self.rule.within is None
 
     @property
@@ -278,11 +266,7 @@ class _PartWalk:
         return FoundParts(self._status, self._ends - self._starts, rounds, tuple(self._errors))
 
     def _select_unfinished(self, active: Offsets, number: int) -> Offsets:
-        """Return the frames that have a further part.
-
-        Args:
-            number: the number of parts that were found in each frame.
-        """
+        """Return the frames that have a further part."""
         if np.count_nonzero(self._status):
             active = active[self._status[active] == FOUND]
         if self._rule.count is not None:
@@ -296,11 +280,7 @@ class _PartWalk:
         return active
 
     def _find_next_parts(self, active: Offsets) -> list[PartRound]:
-        """Find the next part of each frame.
-
-        The kind of a part is the first kind with matching constants. In a truncated part, only the
-        available bytes are compared.
-        """
+        """Find the next part of each frame."""
         pieces = list[PartRound]()
         for number, kind in enumerate(self._region.kinds):
             if not len(active):
@@ -367,10 +347,7 @@ class _PartWalk:
         self._errors += [refused.error] if refused.error else []
 
     def _check_declared_sizes(self, layout: Layout, which: Offsets) -> Offsets:
-        """Return the frames in which the sizes in the next part agree with its layout.
-
-        All other frames get the status `LENGTH`.
-        """
+        """Return the frames in which the sizes in the next part agree with its layout."""
         if not layout.held:
             return which
         matches = self._match_constants(which, merge_constants(sort_constants(layout.held)))
@@ -380,10 +357,7 @@ class _PartWalk:
         return which[matches]
 
     def _check_bounds(self, layout: Layout, which: Offsets) -> Offsets:
-        """Return the frames in which the next part is complete and has the right size.
-
-        Sets the status of all other frames.
-        """
+        """Return the frames in which the next part is complete and has the right size."""
         ends = self._ends[which] + layout.size
         announced = self._announced[which]
         wrong = (ends - self._starts[which] > self._room) | (layout.size == 0)
@@ -458,10 +432,7 @@ class _PartWalk:
 
 
 def _fits_columns(formula: tree.Formula) -> bool:
-    """Return whether the value of an operand is exact in 64-bit columns.
-
-    This is true for fields, for comparisons, and for numbers that are not too large.
-    """
+    """Return whether the value of an operand is exact in 64-bit columns."""
     if isinstance(formula, tree.Op):
         return formula.symbol in tree.COMPARISONS
     return not isinstance(formula, int) or abs(formula) < 1 << MAX_COLUMN_BITS
@@ -478,7 +449,6 @@ def match_constants_at(
     In a truncated candidate, only the available bytes are compared.
 
     Args:
-        offsets: the offsets of the candidates.
         stops: the offset after the last byte of each candidate; by default the end of the buffer.
     """
     matches: NDArray[np.bool_] | None = None

@@ -1,7 +1,7 @@
 """Parse and build frames that have no layout, with construct, one at a time.
 
-A frame has no layout if the offset of a part cannot be computed. An example is a part after a
-length that is a Python function with branches. `lidarspec show` prints the part and the reason.
+A frame has no layout if the offset of a part cannot be computed. `lidarspec show` prints the part
+and the reason.
 """
 
 from __future__ import annotations
@@ -41,9 +41,6 @@ def parse_plain(frame: Frame, data: bytes, *, verify: bool = True) -> tuple[Any,
 def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
     """Return the bytes of a frame.
 
-    The values of length fields are known only after the frame was built. The frame is therefore
-    built a second time with these values.
-
     Raises:
         UsageError: for values that construct does not accept.
         SpecError: if an expression of the struct fails.
@@ -75,10 +72,7 @@ def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
 
 
 def _add_code_names(value: Any, path: str, schema: Schema) -> Any:
-    """Replace each number that has a label by the string that construct uses for it.
-
-    When construct builds a struct, `Const` and `Switch` compare these strings.
-    """
+    """Replace each number that has a label by the string that construct uses for it."""
     if isinstance(value, Mapping):
         return Container(
             (name, _add_code_names(member, f"{path}.{name}" if path else name, schema))
@@ -136,11 +130,7 @@ def _iter_fields(
 
 
 def _has_spans(value: Any, start: int, end: int) -> bool:
-    """Return whether a value is a struct with the offsets of its members in the frame.
-
-    Returns False if construct has decoded the bytes of the struct first. The offsets then refer to
-    the decoded bytes.
-    """
+    """Return whether a value is a struct that has the offsets of its members."""
     if not isinstance(value, dict) or not value.get("_spans"):
         return False
     spans = value["_spans"].values()

@@ -1,31 +1,11 @@
 """Compute the checksums of many frames at once, given as rows of bytes.
 
 `compute_over_spans` and `compute_checksums` have fast methods for the algorithms of
-`lidarspec.spec.checksums`. For an algorithm of a plugin they call its method `batch`. `load_words`
-converts rows to columns of words of eight bytes, so that one call of NumPy processes the same eight
-bytes of every row.
+`lidarspec.spec.checksums`. For an algorithm of a plugin they call its method `batch`.
 
 A CRC is linear: the register after a row is the XOR of the contributions of its bytes. *Advancing*
 a byte by d means computing its contribution to the register d bytes later. `compute_registers`
-selects one of four methods:
-
-* `_compute_by_position`: for few and short rows. There is one table lookup for each byte, in a
-  table for its position in the row.
-* `_compute_by_zlib`: for longer rows of the usual CRC-32, with one call of `zlib.crc32` for each
-  row.
-* `_compute_narrow`: for registers of at most one byte. The first half of each row is advanced to
-  the second half, by a table of 256 entries, and XORed onto it. This is repeated until one byte is
-  left. For many rows, `_sum_words` first reduces each row to one word without tables.
-* `_compute_wide`: for all other rows. The registers of all rows advance by two bytes at a time, by
-  a table of 65,536 entries. Long rows are split into segments that are computed side by side and
-  then joined in pairs.
-
-In GF(2), the eighth power of a polynomial p(x) is p(x**8). A byte advanced by eight is therefore
-the XOR of the same byte advanced by n, for each term x**n of the polynomial with n < 8.
-`_sum_words` uses this: it XORs each word onto some of eight sums, one for each n from 0 to 7, and
-then advances and combines the sums.
-
-The tables depend only on the polynomial and the distance. Registers are in wire order, see `Crc`.
+selects the fastest of four methods.
 """
 
 from __future__ import annotations
@@ -83,10 +63,7 @@ _BYTE_BITS = np.uint64(8)
 
 
 def compute_checksums(algorithm: Checksum, rows: NDArray[np.uint8]) -> Values:
-    """Return the checksum of each row, (n,), given rows of equal length, (n, m).
-
-    The rows need not be contiguous.
-    """
+    """Return the checksum of each row, (n,), given rows of equal length, (n, m)."""
     return compute_over_spans(algorithm, rows, ((0, rows.shape[1]),))
 
 
@@ -170,9 +147,6 @@ def _group_word_masks(
     algorithm: WordXor, number: int
 ) -> list[tuple[list[int], tuple[np.uint64, np.uint64]]]:
     """Return masks that select the low and the high bytes in each word of a row.
-
-    Args:
-        number: the number of words, as returned by `load_words`.
 
     Returns:
         Pairs of the indices of some words, and the two masks of these words (low, high).
@@ -265,13 +239,9 @@ def load_words(
 def _plan_words(
     spans: Spans, size: int, zeros_first: bool
 ) -> tuple[int, list[tuple[int, int, int]], list[tuple[Any, ...]]]:
-    """Return how to copy the bytes of the spans of a row to words.
-
-    Returns:
-        The number of words; the copies of whole words, as (first word, number of words, offset in
-        the row); and the copies of parts of a word, as (word, offset of eight bytes in the row,
-        right shift, mask or None, left shift). The shifts and the mask are applied in this order.
-    """
+    """Return how to copy the spans of a row to words of eight bytes."""
+    # A run is (first word, number of words, offset in the row). A part is (word, offset of eight
+    # bytes in the row, right shift, mask or None, left shift).
     total = _count_bytes(spans)
     number = -(-total // 8)
     runs = list[tuple[int, int, int]]()
@@ -377,11 +347,7 @@ def _compute_by_position(
     poly: int,
     refin: bool,
 ) -> NDArray[Any]:
-    """Return the result of `compute_registers` for a few short rows.
-
-    The register is the XOR of the contributions of all bytes. A table for each position contains
-    these contributions.
-    """
+    """Return the result of `compute_registers` for a few short rows."""
     table, firsts, begun = make_place_tables(length, start, width, poly, refin)
     found: NDArray[Any] = np.bitwise_xor.reduce(
         table.take(gather_spans(rows, spans) + firsts), axis=1
@@ -394,8 +360,6 @@ def make_place_tables(
     length: int, start: int, width: int, poly: int, refin: bool
 ) -> tuple[NDArray[Any], NDArray[np.intp], Any]:
     """Return the contribution of each byte to the final register, by position.
-
-    The contribution is the register after a row in which all other bytes are 0.
 
     Returns:
         The table, (256 * length,), with 256 entries for each position; the index at which the
@@ -418,6 +382,8 @@ def _compute_narrow(
     rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
 ) -> NDArray[np.uint8]:
     """Return the result of `compute_registers` for registers of at most one byte."""
+    # The first half of each row is advanced to the second half by a table, and XORed onto it. This
+    # is repeated until one byte is left.
     length = _count_bytes(spans)
     if not length:
         return np.full(len(rows), start, np.uint8)
@@ -445,11 +411,11 @@ def _compute_narrow(
 
 
 def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
-    """Return one word for each row, (n,).
-
-    The register after the word is the same as the register after the row. The polynomial `poly`
-    must have eight bits.
-    """
+    """Reduce each row to one word that results in the same CRC register, (n,)."""
+    # In GF(2), the eighth power of a polynomial p(x) is p(x**8). A byte advanced by eight is
+    # therefore the XOR of the same byte advanced by n, for each term x**n of the polynomial with
+    # n < 8. Each word is XORed onto some of eight sums, one for each n from 0 to 7. The sums are
+    # then advanced and combined. `poly` has eight bits.
     shares = _assign_sums(len(columns), poly)
     onto = np.uint64(sum(1 << 8 * (7 - power) for power in range(8) if poly >> power & 1))
     total = np.zeros(columns.shape[1], np.uint64)
@@ -468,10 +434,8 @@ def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
 
 @lru_cache(maxsize=256)
 def _assign_sums(number: int, poly: int) -> tuple[int, ...]:
-    """Return a mask for each word, which selects the sums that the word is XORed onto.
-
-    Bit n of the mask, from 0 to 7, stands for the sum that `_sum_words` advances by n bytes.
-    """
+    """Return for each word a bit mask of the sums in `_sum_words` that contain it."""
+    # Bit n stands for the sum that `_sum_words` advances by n bytes.
     found = [1]
     while len(found) < number:
         share = found[-1]
@@ -485,6 +449,8 @@ def _compute_wide(
     rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
 ) -> NDArray[Any]:
     """Return the result of `compute_registers` for registers of any width."""
+    # The registers of all rows advance by two bytes at a time. Long rows are split into segments,
+    # which are computed side by side and then joined in pairs.
     rows = gather_spans(rows, spans)
     (count, length), table = rows.shape, _make_word_table(width, poly, refin)
     # A power of two. It is small, because many segments share the cost of a NumPy call.
@@ -512,10 +478,7 @@ def _compute_wide(
 
 @lru_cache(maxsize=1024)
 def _make_advance_table(distance: int, width: int, poly: int, refin: bool) -> bytes:
-    """Return the table of 256 bytes that advances a byte by `distance` bytes.
-
-    The register must have at most one byte.
-    """
+    """Return the table of 256 bytes that advances a byte by `distance` bytes."""
     if distance == 1:
         return bytes(byte_table(width, poly, refin))
     half = _make_advance_table(distance // 2, width, poly, refin)

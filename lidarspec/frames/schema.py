@@ -63,10 +63,7 @@ class PathMapping(dict[str, _Field]):
     The path of an element has an index: "columns[0].timestamp".
 
     Args:
-        values: the values by the paths of the fields.
-        element: a function that returns the value of an element, or None if it does not exist. Its
-            arguments are the value of the field, the path of the element, and the indices by the
-            path of the array.
+        element: a function that returns the value of an element; None if it does not exist.
     """
 
     def __init__(
@@ -171,19 +168,12 @@ class Schema:
 
     @cached_property
     def separate_parts(self) -> Mapping[str, PartSequence]:
-        """The sequences of parts that are not arrays, by path.
-
-        An array with elements of different sizes is a sequence of parts as well
-        (`PartSequence.is_array`).
-        """
+        """The sequences of parts that are not arrays, by path."""
         return {axis: node for axis, node in self.parts.items() if not node.is_array}
 
     @cached_property
     def scan_names(self) -> Mapping[str, FieldInfo]:
-        """The fields of the frame and its parts, by the names that scans and clocks use.
-
-        The path of a field in a part includes the name of the kind of part: "tags.points.angle".
-        """
+        """The fields of the frame and its parts, by the names that scans and clocks use."""
         names = dict(self.fields)
         for before, kind in self.part_kinds.items():
             names |= {
@@ -249,11 +239,7 @@ class Schema:
         return found[0]
 
     def find_sequence(self, path: str) -> str | None:
-        """Return the path of the array of parts that contains a field; None if none does.
-
-        Args:
-            path: the path of the array itself, or of a field in its elements.
-        """
+        """Return the path of the array of parts that contains a field; None if none does."""
         if not self.parts:
             return None
         base = without_indices(path)[0]
@@ -296,7 +282,7 @@ def find_count_field(formula: Formula, fields: Mapping[str, FieldInfo]) -> str |
 
 @lru_cache(maxsize=4096)
 def make_schema(root: Node) -> Schema:
-    """Return the fields of a frame tree. The result is cached."""
+    """Return the fields of a frame tree."""
     fields: dict[str, FieldInfo] = {}
     arrays: dict[str, Formula | None] = {}
     derived: dict[str, FieldInfo] = {}
@@ -352,10 +338,7 @@ def _add_struct_docs(fields: dict[str, FieldInfo], structs: dict[str, str]) -> d
 def _make_element(
     arrays: Mapping[str, Formula | None], info: FieldInfo, path: str, indices: Mapping[str, int]
 ) -> FieldInfo | None:
-    """Return the declaration of one element of a field; None if no frame has it.
-
-    The element is optional if the number of elements varies.
-    """
+    """Return the declaration of one element of a field; None if no frame has it."""
     element = get_element(info, path, indices)
     counts = [(arrays.get(axis), index) for axis, index in indices.items()]
     if element is None or any(
@@ -438,10 +421,7 @@ def _add_field(fields: dict[str, FieldInfo], info: FieldInfo) -> None:
 def _add_count(
     arrays: dict[str, Formula | None], axis: str, count: Formula | None, *, optional: bool
 ) -> None:
-    """Store the declared count of an array.
-
-    If two branches of the struct declare different numbers, None is stored.
-    """
+    """Store the declared count of an array."""
     if optional and isinstance(count, int):
         count = Op("+", (count, 0))  # not a number, because only some frames have the array
     known = arrays.setdefault(axis, count)

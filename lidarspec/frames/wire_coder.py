@@ -1,9 +1,7 @@
 """Convert between encoded frames and the bytes of their structs.
 
 Most frames are sent as the bytes of their struct (`Coder`). A frame type with a wire form
-(`lidarspec.spec.wire_forms`) has a `FormCoder`. While a frame is decoded, the coder finds the next
-fields by the layouts of the struct, and passes them to the wire form. The coder also describes the
-fault of bytes that are not a valid frame.
+(`lidarspec.spec.wire_forms`) has a `FormCoder`.
 """
 
 from __future__ import annotations
@@ -41,10 +39,7 @@ MAX_SHOWN_BYTES = 12
 
 
 class _Undecoded(Decoded):
-    """The result for a frame that is sent as the bytes of its struct.
-
-    An offset in the struct is the same offset in the frame.
-    """
+    """The result for a frame that is sent as the bytes of its struct."""
 
     @property
     def offsets(self) -> list[int]:
@@ -88,8 +83,6 @@ class Coder:
 
         Args:
             values: the parsed values; the frame is added under the name `SPELLING`.
-            struct: the bytes of the struct.
-            data: the encoded frame.
         """
         return values
 
@@ -135,12 +128,12 @@ def _find_known_fields(node: HeaderNode) -> tuple[tuple[Leaf, ...], int]:
 class FormCoder(Coder):
     """Encodes and decodes frames with a wire form.
 
+    All methods raise `PluginError` if a plugin's wire form raises an exception.
+
     Attributes:
         form: the wire form.
         tree: the layouts of the struct.
         prefix: the bytes before the first number that are the same in all frames, by offset.
-
-    All methods raise `PluginError` if a plugin's wire form raises an exception.
 
     Raises:
         SpecError: if the fields of the struct do not have computable offsets.
@@ -184,10 +177,7 @@ class FormCoder(Coder):
         return replace(decoded, problem=self._find_problem(data, size, decoded))
 
     def decode_whole(self, data: bytes) -> Decoded:
-        """Decode a frame that consists of exactly these bytes.
-
-        If the bytes are invalid, the `reason` of the result's `problem` may be empty.
-        """
+        """Decode a frame that consists of exactly these bytes."""
         with _form_errors(self.form.decode):
             decoded = self.form.decode(data, _FieldFinder(self.tree))
             if not isinstance(decoded, Decoded):
@@ -290,10 +280,7 @@ class FormCoder(Coder):
 
 @contextmanager
 def _form_errors(method: Callable[..., Any]) -> Iterator[None]:
-    """Convert exceptions of a method of a plugin's wire form to `PluginError`.
-
-    Exceptions of lidarspec's own wire forms are not converted, because they are bugs.
-    """
+    """Convert exceptions of a method of a plugin's wire form to `PluginError`."""
     try:
         yield
     except SpecError:
@@ -306,11 +293,7 @@ def _form_errors(method: Callable[..., Any]) -> Iterator[None]:
 
 
 def _describe_field(leaves: tuple[Leaf, ...], offset: int, end: int) -> tuple[str, int, str]:
-    """Return path, offset and expected type of the field at an offset of the struct.
-
-    Args:
-        end: the size of the struct.
-    """
+    """Return the path, the offset and the expected type of the field at an offset."""
     offsets, owners = _locate_elements(leaves)
     index = int(offsets.searchsorted(offset, "right")) - 1
     path = ""
@@ -331,7 +314,7 @@ def _describe_field(leaves: tuple[Leaf, ...], offset: int, end: int) -> tuple[st
 
 @functools.lru_cache(maxsize=2048)
 def frame_coder(frame: Frame) -> Coder:
-    """Return the coder of a frame type. It is cached."""
+    """Return the coder of a frame type."""
     if frame.wire is None:
         return Coder(frame)
     return FormCoder(frame, frame.wire)
@@ -347,10 +330,7 @@ def list_runs(layout: Layout) -> Sequence[Run]:
 
 @functools.lru_cache(maxsize=1024)
 def list_runs_between(leaves: tuple[Leaf, ...], first: int, end: int) -> tuple[Run, ...]:
-    """Return the fields between two offsets of a struct, grouped into runs.
-
-    Bytes between fields, such as constants without a name, are treated as a text field.
-    """
+    """Return the fields between two offsets of a struct, grouped into runs."""
     offsets, owners = _locate_elements(leaves)
     inside = slice(int(offsets.searchsorted(first)), int(offsets.searchsorted(end)))
     offsets = offsets[inside]
@@ -385,7 +365,7 @@ def _find_element_types(
 ) -> tuple[NDArray[np.intp], NDArray[np.str_], NDArray[np.bool_]]:
     """Return the size, kind and byte order of one element of each field.
 
-    The size is in bytes. The kind is "S" for bytes. A bit block is one number.
+    The size is in bytes. The kind is "S" for bytes.
     """
     kinds = list[str]()
     is_little = list[bool]()
@@ -410,10 +390,7 @@ def _find_element_types(
 
 @functools.lru_cache(maxsize=256)
 def _locate_elements(leaves: tuple[Leaf, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the offset of each element, and the index of the field that contains it.
-
-    The offsets are ascending. A bit block counts as one element of its first field.
-    """
+    """Return the offset of each element, and the index of the field that contains it."""
     offsets = [np.zeros(0, np.intp)]
     owners = [np.zeros(0, np.intp)]
     for index, leaf in enumerate(leaves):
@@ -438,7 +415,7 @@ def _join_bytes(bytes_by_offset: dict[int, int]) -> bytes:
 
 
 def _wrap_values(values: NDArray[np.uint64], largest: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return each value modulo its largest value plus 1.
+    """Return each value modulo (its largest value + 1).
 
     Args:
         largest: the largest allowed value for each column of `values`.

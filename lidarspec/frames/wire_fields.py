@@ -1,8 +1,7 @@
 """Find the fields of one frame with their offsets, even if it is invalid or truncated.
 
-`examine` finds the layout of the bytes, or as much of it as truncated bytes determine.
-`ExaminedFrame.fields` iterates over the frame tree with this layout. `lidarspec.frames.diagnose`
-and the explanations of frames use both.
+`examine` finds the layout, as far as the bytes determine it. `ExaminedFrame.fields` yields the
+fields.
 """
 
 from __future__ import annotations
@@ -106,9 +105,7 @@ class ExaminedFrame:
         root: the tree of the frame type.
         data: the bytes.
         known: the layout, or the `HeaderWalk` with the layout up to the error in `failure`.
-        failure: the error that prevented a layout: `UnknownSelectorError` if the bytes
-            are truncated, `TooLongError`, `UnknownPartError`, or an error of an expression. None if
-            there is a layout.
+        failure: the error that prevented a layout; None if there is a layout.
         start: the offset of a part in the frame; 0 for a frame.
         prefix: the path of a part in the frame; "" for a frame.
         is_bounded: for a part, whether the frame has bytes after its parts.

@@ -1,9 +1,7 @@
 """Make the wire table of a frame type: offset, size and meaning of each field.
 
-The table is made from the tree, without the bytes of a frame. An offset or size that depends on
-header fields is therefore a formula ("10 + 3*i"), and a part that only some frames have is marked
-with its condition. `extent` returns the size of any part in this form. Exports and explanations use
-the same texts for fields, bits and formulas.
+The table is made without the bytes of a frame. An offset or size that depends on header fields is
+therefore a formula ("10 + 3*i").
 """
 
 from __future__ import annotations
@@ -260,10 +258,7 @@ def _make_part_path(shown: str, part: tree.Part) -> str:
 
 
 def _describe_bits(part: tree.Part) -> tuple[str, str]:
-    """Return the size and the type of a part of a bit block, as texts.
-
-    The size is in bits. For an integer that is wider than 64 bits, the size is in bytes.
-    """
+    """Return the size and the type of a part of a bit block, as texts."""
     if part.info.dtype is None and part.bits.run is not None and part.bits.is_whole:
         order, _, size, _ = part.bits.run
         return (
@@ -398,10 +393,7 @@ def describe_field(info: tree.FieldInfo) -> str:
 
 
 def format_hex(value: object, bits: int) -> str:
-    """Return bytes or an integer in hexadecimal.
-
-    An integer has as many digits as its width requires.
-    """
+    """Return bytes or an integer in hexadecimal."""
     if isinstance(value, bytes | bytearray):
         return value.hex(" ")
     if isinstance(value, int):
