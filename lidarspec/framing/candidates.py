@@ -1,17 +1,9 @@
 """Find and check the candidates in a piece of a stream.
 
-A candidate is an offset at which the constants of a frame type match.
-
-A frame type with `after` becomes active when a frame of the type named in its `after` arrives. It
-stays active until a frame of another type that is named in some `after` arrives. The active types
-can therefore change with every frame. To keep this fast, all candidates of one type in a piece are
-checked together when the type first becomes active.
-
-Weak types (`confirm` > 1) are checked in the same way, but of each run, only the first frame is
-used as a candidate (`weak_frames`).
-
-At the end of a piece, some of the constants of a candidate may not have arrived yet. The candidate
-is then checked with the next piece. Candidates of weak types are checked at once.
+A candidate is an offset at which the constants of a frame type match. The active types may change
+with every frame (`after`). All candidates of one type in a piece are therefore checked together,
+when the type first becomes active. For a weak type (`confirm` > 1), only the first frame of each
+run is a candidate (`weak_frames`).
 """
 
 from __future__ import annotations
@@ -145,10 +137,7 @@ class Framing:
         return active
 
     def filter(self, kinds: Sequence[int]) -> ConstantFilter:
-        """Return a filter by the constants of some types.
-
-        The first two constants of each type are compared before filtering.
-        """
+        """Return a filter by the constants of some types."""
         key = tuple(kinds)
         if key not in self._filters:
             self._filters[key] = ConstantFilter([self.marks[kind][SHARED_MARKS:] for kind in key])
@@ -182,7 +171,6 @@ class Framing:
 
         Args:
             kind: the index of the type.
-            buffer: the bytes.
             offsets: offsets at which the constants of the type match.
             stops: the offset at which the bytes of each candidate end; by default the end of the
                 buffer.
@@ -225,15 +213,14 @@ def find_by_constants(buffer: Bytes1D, constants: Marks) -> Offsets:
 class ConstantFilter:
     """Finds the offsets at which the constants of types match, for several types at once.
 
-    A set of types is an integer with one bit for each type. There is a table for each offset at
-    which a frame has a constant. For each value of the byte at this offset, the table contains the
-    set of types that allow the value.
-
     Args:
         constants: the constants of each type, for at most `MAX_TYPES` types.
     """
 
     def __init__(self, constants: Sequence[Marks]) -> None:
+        # A set of types is an integer with one bit for each type. For each
+        # offset at which a frame has a constant, a table contains the set of types that allow each
+        # value of the byte.
         self._all_types = np.uint64((1 << len(constants)) - 1)
         self._tables: dict[int, NDArray[np.uint64]] = {}
         for number, marks in enumerate(constants):
@@ -273,9 +260,7 @@ class LiveCandidates:
     """The candidates of a piece that may be accepted under the same active types.
 
     Attributes:
-        frames: the valid and incomplete candidates, sorted by offset. If several types match at one
-            offset, the candidate has the type that is declared first. For a weak type, only the
-            first frame of each run is included.
+        frames: the valid and incomplete candidates, sorted by offset, at most one at each offset.
         ends: the end offset of each candidate, (n,); for the first frame of a run, the end of the
             run.
         runs: the runs of each weak type, by type index.
@@ -298,7 +283,6 @@ class Candidates:
         buffer: the bytes to search, shortened if there are too many candidates.
         is_whole: whether `buffer` was not shortened.
         checked: the checked candidates of each type that was searched so far, by type index.
-            Types without candidates are left out.
     """
 
     def __init__(
@@ -374,10 +358,7 @@ class Candidates:
         return Frames.make_empty(self.buffer)
 
     def _find_waiting(self, kinds: Sequence[int]) -> list[Frames]:
-        """Return the candidates of these types whose last constant has not arrived yet.
-
-        If several of the types match at one offset, the first of these types is used.
-        """
+        """Return the candidates of these types whose last constant has not arrived yet."""
         first_kinds: dict[int, int] = {}
         for kind in reversed(kinds):
             first_kinds |= dict.fromkeys(self._waiting.get(kind, ()), kind)
@@ -396,10 +377,7 @@ class Candidates:
         ]
 
     def _find_by_type(self, mode: SearchState) -> dict[int, Offsets]:
-        """Return the offsets at which the constants of each type match, by type index.
-
-        Only active types that were not searched before are included.
-        """
+        """Return the offsets of candidates of newly active types, by type index."""
         groups: dict[Marks, list[int]] = {}
         for kind in self._framing.active_types(mode):
             if kind not in self._known:
@@ -434,10 +412,7 @@ class Candidates:
             self.checked[kind] = own
 
     def _count_arrived(self, kind: int, offsets: Offsets) -> int:
-        """Return how many candidates can be checked now.
-
-        The candidates after them wait, because their constants have not all arrived.
-        """
+        """Return how many candidates can be checked now."""
         if not len(offsets) or self.final or self._framing.is_weak(kind):
             return len(offsets)
         last = len(self.buffer) - self._framing.ends[kind]

@@ -1,11 +1,8 @@
 """Join messages that arrive in several datagrams, before they are framed.
 
-A fragment contains the key of its message, its index and the number of fragments
-(`lidarspec.spec.links.Assembled`). Fragments may arrive in any order, and may arrive twice. A
-message is returned when all its fragments have arrived. An incomplete message is dropped when a few
-newer messages have begun, when a second has passed, or when no data arrives. If further fragments
-of a dropped message arrive, they are dropped as well. All dropped fragments are counted. Datagrams
-that are not fragments are returned unchanged.
+Fragments of a message may arrive in any order. A message is returned when all its fragments have
+arrived. An incomplete message is dropped when a few newer messages have begun, when a second has
+passed, or when no data arrives. Datagrams that are not fragments are returned unchanged.
 """
 
 from __future__ import annotations

@@ -1,12 +1,7 @@
 """Find the frame type of each datagram, which is one whole frame or invalid.
 
-As in a stream, the types are tried in the order of declaration, and the first type that matches is
-used. A type with `after` is tried only while it is active. A frame must be as long as its datagram.
-
-Datagrams of one size and type are checked as the rows of an array
-(`lidarspec.framing.regular_rows`). Otherwise, the datagrams are checked type by type, and each type
-is tried only for datagrams that no earlier type has accepted. If a plugin raises an error for a
-datagram, this datagram is checked alone, so that the other datagrams are not lost.
+The types are tried in the order of declaration, and the first type that matches is used. A type
+with `after` is tried only while it is active. A frame must be as long as its datagram.
 
 If a message is sent in fragments, they are joined before the type is found
 (`lidarspec.framing.datagram_assembly`).
@@ -61,8 +56,8 @@ class _DatagramBatch:
     """Checks a batch of datagrams, once for each set of active types.
 
     Args:
-        regular_frames: the result of checking the datagrams as frames of one type and layout; None
-            if this was not possible.
+        regular_frames: the datagrams as frames of one type and layout; None if this is not
+            possible.
     """
 
     def __init__(
@@ -96,8 +91,7 @@ class _DatagramBatch:
     def _sort_from(self, position: int, mode: SearchState) -> Frames:
         """Find the types of the datagrams, beginning with index `position`.
 
-        The result ends with the first frame that changes the active types, or with the last
-        datagram.
+        The result ends with the first frame that changes the active types.
         """
         if mode.after not in self._known:
             frames, reasons = self._check(self._starts[position:], self._sizes[position:], mode)
@@ -128,13 +122,8 @@ class _DatagramBatch:
     def _check(self, starts: Indices, sizes: Indices, mode: SearchState) -> tuple[Frames, Status]:
         """Find the type and the layout of each datagram.
 
-        Args:
-            mode: the search state, which determines the active types.
-
         Returns:
-            The datagrams as frames, and a status for each datagram. For an invalid datagram, the
-            status is the reason: 0 if the datagram has the constants of no type, and `PLUGIN` if
-            the datagram must be checked alone.
+            The datagrams as frames, and the reason for each invalid datagram.
         """
         number = len(starts)
         common_size = broadcast_value(sizes)
@@ -208,8 +197,6 @@ class _DatagramBatch:
     ) -> Frames:
         """Count invalid datagrams by reason.
 
-        A datagram for which the plugin failed is checked again, alone.
-
         Returns:
             The datagrams up to the first frame that changes the active types.
         """
@@ -231,10 +218,7 @@ class _DatagramBatch:
         return frames
 
     def _check_alone(self, datagram: Frames, mode: SearchState) -> Frames | None:
-        """Check one datagram, and return it as a frame.
-
-        If it is invalid, counts the reason and returns None.
-        """
+        """Check one datagram, and return it as a frame; None if it is invalid."""
         rejected = 0
         start = datagram.starts
         size = datagram.sizes
@@ -257,11 +241,7 @@ class _DatagramBatch:
     def _count_by_reason(
         self, reasons: NDArray[np.uint8], sizes: Indices, mode: SearchState
     ) -> None:
-        """Count rejected datagrams by reason.
-
-        The reason is `bad_constant` if a datagram has the constants of no type, or `bad_length` if
-        it is too short for them.
-        """
+        """Count rejected datagrams by reason."""
         least = min(self._framing.ends[kind] for kind in self._framing.active_types(mode))
         unknown = np.isin(reasons, (VALID, CONSTANT))
         others = unknown & (sizes >= max(least, 1))

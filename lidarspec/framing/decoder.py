@@ -1,10 +1,8 @@
 """`Decoder`: finds frames as input arrives, and counts all other bytes.
 
-This module uses no clock, port or thread.
-
-A byte stream is divided into pieces that fit in the cache. If it is not known yet whether the last
-bytes of a piece are a frame, they are searched again with the next piece. On a datagram link, each
-datagram is one frame. The frames and counters do not depend on the division of the input.
+On a byte stream, bytes at the end of the input may be an incomplete frame. They are searched again
+with the next input. On a datagram link, each datagram is one frame. The frames and counters do not
+depend on the division of the input.
 """
 
 from __future__ import annotations
@@ -307,9 +305,6 @@ class Decoder:
     ) -> NDArray[np.int64]:
         """Count the skipped bytes in a batch of datagrams.
 
-        Args:
-            good: whether each datagram is a frame.
-
         Returns:
             The number of skipped bytes before each frame, without fillers.
         """
@@ -366,11 +361,7 @@ class Decoder:
         return start
 
     def _decode_piece(self, buffer: Bytes1D, *, final: bool) -> PieceResult:
-        """Find the frames in a piece of a stream.
-
-        If the piece begins with frames at equal distances, these frames are checked as the rows of
-        an array. Otherwise the piece is searched.
-        """
+        """Find the frames in a piece of a stream."""
         piece = None
         if not final:
             piece = find_regular_frames(self.framing, buffer, self._mode, self._base)
@@ -423,7 +414,6 @@ class Decoder:
         """Count the bytes of skipped ranges.
 
         Args:
-            buffer: the bytes.
             sizes: the size of each skipped range in bytes.
             stops: the offset after each skipped range.
 
@@ -469,11 +459,7 @@ def _make_framing(names: tuple[str, ...], frames: tuple[Frame, ...], sums: Sums 
 
 
 def _compute_offsets(sizes: NDArray[np.intp], first: int = 0) -> Numbers:
-    """Return the offsets of consecutive pieces, given their sizes.
-
-    Args:
-        first: the offset of the first piece.
-    """
+    """Return the offsets of consecutive pieces, given their sizes."""
     if size := broadcast_value(sizes):
         return range(first, first + len(sizes) * size, size)
     starts = np.cumsum(sizes)

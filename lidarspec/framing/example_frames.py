@@ -1,9 +1,7 @@
 """Make valid frames with seeded random content, for tests, docs and the REPL.
 
-A random header determines a layout. The rest of the frame is filled with random bytes, and
-constants and checksums are set. Frames that are not plausible are drawn again. If random frames are
-never plausible, the values of the sensor's `sweep` are used. Frames without layouts are drawn field
-by field.
+A random header determines a layout, and the rest of the frame is filled with random bytes. Frames
+that are not plausible are drawn again.
 """
 
 from __future__ import annotations
@@ -71,7 +69,7 @@ def example(sensor: SensorDescription, frame: str, *, seed: int = 0) -> bytes:
     """Return the bytes of a valid frame with seeded random content.
 
     Raises:
-        UnknownFrame: if the sensor has no such frame type. The error suggests the closest name.
+        UnknownFrame: if the sensor has no such frame type.
     """
     if frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
@@ -84,8 +82,7 @@ def random_frame(
     """Return a valid frame with a random header and random content.
 
     Args:
-        drawn: functions that draw the raw values of certain fields, by path. They are needed for
-            fields whose random values are hardly ever valid.
+        drawn: functions that draw the raw values of certain fields, by path.
     """
     engine = get_codec(sensor.frames[frame])
     if not engine.is_compiled or engine.schema.has_measured_sizes:
@@ -108,8 +105,7 @@ def draw_row(
     Args:
         frame: the name of a frame type with layouts and without parts.
         drawn: functions that draw the raw values of certain fields, by path.
-        tries: the maximum number of attempts with random frames. If all of them fail, frames with
-            the values of the `sweep` are tried as often.
+        tries: the maximum number of random frames to try.
 
     Raises:
         SpecError: if none of the frames is plausible.
@@ -137,8 +133,6 @@ def make_random_header(
     engine: Codec, source: random.Random, drawn: Drawn = NOTHING
 ) -> tuple[Layout, dict[str, int]]:
     """Return the layout of a random header, and the raw values of its fields by path.
-
-    The fields are those that the layout depends on.
 
     Args:
         drawn: functions that draw the raw values of certain fields, by path.
@@ -209,11 +203,7 @@ LETTERS = b"abcdefghijklmnopqrstuvwxyz"
 def _make_random_rows(
     engine: Codec, layout: Layout, number: int, source: random.Random
 ) -> NDArray[np.uint8]:
-    """Return random structs with values that are allowed and can be encoded.
-
-    Returns:
-        (number, size) bytes.
-    """
+    """Return random structs with allowed values, (number, size)."""
     rows = (
         np.frombuffer(source.randbytes(number * layout.size), np.uint8)
         .reshape(number, layout.size)
@@ -239,8 +229,6 @@ def draw_frame(
     tries: int = LARGEST_BATCH * MAX_TRIES,
 ) -> bytes:
     """Draw the values of a frame one by one, and return a valid frame.
-
-    This is used for frames with parts, and for frames without layouts.
 
     Args:
         drawn: functions that draw the raw values of certain fields, by path.
@@ -358,10 +346,7 @@ def _draw_from_sweep(
     drawn: Drawn,
     tries: int,
 ) -> tuple[Layout, NDArray[np.uint8]]:
-    """Return a layout and a struct with the values of the sensor's `sweep`.
-
-    This is used if random values are never plausible.
-    """
+    """Return a layout and a struct with the values of the sensor's `sweep`."""
     sweep = sensor.simulation_of(frame).sweep
     if sweep is None:
         raise SpecError(
@@ -395,10 +380,7 @@ def _draw_from_sweep(
 
 
 def _store_swept(leaf: Leaf, rows: NDArray[np.uint8], value: Any) -> None:
-    """Write a value of a sweep into a struct, if value and field have the same length.
-
-    Otherwise the struct keeps its random values.
-    """
+    """Write a value of a sweep into a struct, if value and field have the same length."""
     raw = leaf.raw([value])[(slice(None), *map(slice, leaf.shape))]
     if all(length in (1, room) for length, room in zip(raw.shape[1:], leaf.shape, strict=False)):
         leaf.store(rows, raw)
@@ -423,8 +405,6 @@ def _store_drawn(
 
 def _make_sweep_draws(engine: Codec, values: Mapping[str, Any]) -> Drawn:
     """Return functions that return the raw values of a sweep, by path.
-
-    Arrays and bytes are left out.
 
     Args:
         values: the values of the sweep in units, by path.

@@ -28,10 +28,10 @@ class Codec:
 
     Attributes:
         prefix: the constants that all frames begin with, as (mask, value) by offset.
-        marks: the same constants as a list, whole bytes first because they exclude most candidates.
+        marks: the same constants as a list, whole bytes first.
         size: the size of all frames of the type in bytes; None if sizes differ.
         layout: the layout of all frames; None if layouts differ or construct parses the frames.
-        is_compiled: whether the frames have layouts. Otherwise construct parses each frame.
+        is_compiled: whether the frames have layouts.
     """
 
     layout: Layout | None = None
@@ -60,8 +60,7 @@ class Codec:
         Args:
             buffer: the bytes.
             offsets: the offsets, at which the prefix has to match.
-            stops: the offset at which the bytes of each candidate end, if no more bytes follow. By
-                default, candidates extend to the end of the buffer, and more bytes may follow.
+            stops: the end offset of the bytes of each candidate; None if more bytes may follow.
             kind: the index of this frame type.
             gathered: whether to copy the bytes of candidates to `Frames.rows`.
             sums: a function that computes checksums; by default the declared algorithms are used.
@@ -100,10 +99,7 @@ class Codec:
         return self.prefix
 
     def make_checker(self, layout: Layout) -> CandidateChecker:
-        """Return the checker for candidates of one layout.
-
-        It does not compare the constants in `_checked_constants`.
-        """
+        """Return the checker for candidates of one layout."""
         checker = layout.notes.get(CandidateChecker)
         if checker is None:
             self._conditions = self._conditions or StructConditions(

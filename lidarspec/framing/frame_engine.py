@@ -1,9 +1,6 @@
 """The codec of binary frames with layouts.
 
-`CompiledCodec` checks many candidates at once. The header of a candidate is read once, and its
-layout is kept for making columns. `get_codec` returns the codec of any frame type. Frames with a
-wire form (`lidarspec.framing.text_frames`) and frames without layouts
-(`lidarspec.framing.plain_frames`) have other codecs.
+`CompiledCodec` checks many candidates at once. `get_codec` returns the codec of any frame type.
 """
 
 from __future__ import annotations
@@ -147,11 +144,9 @@ class CompiledCodec(Codec):
         offsets: NDArray[np.intp],
         stops: NDArray[np.intp] | None,
     ) -> list[Group]:
-        """Refuse datagrams that are longer than the largest frame of the type.
-
-        This is used for frame types that extend to the end of the datagram. Such frames do not
-        exist in a stream, so all candidates in a stream are refused.
-        """
+        """Refuse datagrams that are longer than the largest frame of the type."""
+        # The frames of this type extend to the end of the datagram. They do not exist in a stream,
+        # in which `stops` is None.
         is_fitting = np.zeros(len(offsets), np.bool_)
         if stops is not None:
             is_fitting = stops - offsets <= self.frame.max_struct_bytes
@@ -219,10 +214,8 @@ class CompiledCodec(Codec):
         """Check the candidates of one layout.
 
         Returns:
-            Three values: the status of each candidate; the size of each candidate in bytes, or the
-            number of bytes needed to decide about it; and the bytes of complete candidates, (n,
-            size), or None. The bytes are returned only if `gathered` is set, no complete candidate
-            follows an incomplete one, and the bytes are not too many.
+            The status of each candidate; the size of each candidate in bytes, or the number of
+            bytes needed to decide about it; the bytes of complete candidates, (n, size), or None.
         """
         whole = offsets <= (len(buffer) if stops is None else stops) - layout.size
         count = int(np.count_nonzero(whole))
@@ -259,10 +252,7 @@ class CompiledCodec(Codec):
         return self.gather(Frames(joined, repeat(0, len(frames)), np.cumsum(sizes) - sizes, sizes))
 
     def gather(self, frames: Frames) -> CompiledTable:
-        """Return frames of this type as columns.
-
-        No bytes are copied if the frames fill at least half of the buffer.
-        """
+        """Return frames of this type as columns."""
         if frames.rows is not None and frames.layout is not None:
             if 2 * frames.rows.size >= len(frames.buffer):
                 rows = frames.rows
@@ -310,15 +300,8 @@ def _check_incomplete(
 ) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
     """Return the status of incomplete candidates, and how many bytes each requires.
 
-    The status is `SHORT`, unless a constant or a length is already wrong.
-
     Args:
-        layout: the layout of the candidates.
         sizes: the size of each candidate when it is complete, in bytes.
-
-    Returns:
-        The status of each candidate, and the number of bytes required to decide about the
-        candidate.
     """
     status = np.full(len(offsets), SHORT, np.uint8)
     sizes = sizes.copy()

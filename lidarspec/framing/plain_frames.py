@@ -1,8 +1,4 @@
-"""The codec of frames without layouts: construct parses one candidate at a time.
-
-In the struct of such a frame, the offset of a part does not follow from header fields. `lidarspec
-show` prints the part and the reason.
-"""
+"""The codec of frames without layouts: construct parses one candidate at a time."""
 
 from __future__ import annotations
 

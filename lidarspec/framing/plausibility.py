@@ -1,13 +1,10 @@
 """Check many candidates at once by constants, checksums and plausibility.
 
-Each check is applied only to candidates that have passed the checks before it. A candidate with a
-wrong constant is not counted. A candidate with correct constants and a wrong checksum is counted in
-`bad_checksum`, and so on.
+Each check is applied to the candidates that have passed the previous checks.
 
-The `plausible` function of a frame type is traced once. Operands of ``&`` become separate
-conditions. A condition on at most two adjacent bytes is evaluated for all values of these bytes, so
-that frames can be checked by a table lookup, with the same result. If a function cannot be traced,
-it is called with the columns of the candidates.
+The `plausible` function of a frame type is traced once. A condition on one or two adjacent bytes
+becomes a lookup table. A function that cannot be traced is called with the columns of the
+candidates.
 """
 
 from __future__ import annotations
@@ -134,7 +131,7 @@ class CandidateChecker:
         """Set the status of candidates that have a wrong constant or a wrong length.
 
         Args:
-            status: the status of each candidate, which is updated. It is `VALID` before the call.
+            status: the status of each candidate, `VALID` before the call.
         """
         held = match_constants(self._constants, rows) if len(rows) else None
         if held is not None:
@@ -160,11 +157,7 @@ class CandidateChecker:
 def _check_valid(
     status: NDArray[np.uint8], rows: Bytes2D, check: Callable[[Bytes2D], NDArray[np.uint8]]
 ) -> None:
-    """Check the candidates that are valid so far, and set their status.
-
-    Args:
-        check: a function that returns the status of candidates.
-    """
+    """Check the candidates that are valid so far, and set their status."""
     if not np.count_nonzero(status):
         status[:] = check(rows)
         return
@@ -180,10 +173,7 @@ def _check_valid_parts(
     errors: list[PluginError],
     sums: Sums | None,
 ) -> None:
-    """Check the parts of the valid candidates, and set the status of these candidates.
-
-    The parts have to fill their region, and their checksums have to be correct.
-    """
+    """Check the parts of the valid candidates, and set the status of these candidates."""
     for region in layout.regions.values():
         if not region.is_measured or region.has_checks:
             _check_valid(status, rows, functools.partial(_check_parts, region, errors, sums))
@@ -231,7 +221,6 @@ def check_plausibility(frame: Frame, table: Table, errors: list[PluginError]) ->
 
     Args:
         table: frames of one layout, so that no array is padded.
-        errors: the list to which errors of the plugin are added.
     """
     assert frame.plausible is not None
     batch = Batch(table, np.zeros(len(table), np.bool_))
@@ -361,11 +350,10 @@ class _LookupTable:
     Two bytes are read as one integer.
 
     Attributes:
-        limits: the first and the last value for which the condition is true, if it is true for all
-            values between them; else None.
-        bits: (mask, allowed values) of the bits that the condition depends on; None if `limits` is
-            given, or if more than two values are allowed.
-        listed: for each value, whether the condition is true.
+        limits: the first and the last allowed value, if all values between them are allowed;
+            else None.
+        bits: a mask, and the one or two allowed values of the masked bits; else None.
+        listed: for each value, whether it is allowed.
     """
 
     dtype: np.dtype[Any]
@@ -397,8 +385,6 @@ class _LookupTable:
 class LookupCondition:
     """A condition on one or two bytes, which is evaluated by a table lookup.
 
-    The bytes are in each frame, or in each element of an array.
-
     Attributes:
         offset: the offset of the first byte.
         shape: the lengths of the arrays that contain the bytes.
@@ -424,8 +410,6 @@ class LookupCondition:
     def holds_within(self, rows: Bytes2D, lengths: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Return whether the condition is true in each frame, (n,).
 
-        The frames may have arrays of different lengths.
-
         Args:
             rows: the frames, (n, size), padded to one size.
             lengths: the length of the outermost array in each frame, (n,).
@@ -448,11 +432,7 @@ class LookupCondition:
 
 
 def _make_table(part: FrameTest, leaves: Mapping[str, Leaf], size: int) -> _LookupTable:
-    """Return the table of a condition on one or two bytes.
-
-    Args:
-        size: the number of bytes.
-    """
+    """Return the table of a condition on one or two bytes."""
     for dtype in map(np.dtype, ("<u2", ">u2") if size == 2 else ("u1",)):
         # The blocks keep the memory small.
         blocks = np.split(np.arange(1 << 8 * dtype.itemsize, dtype=dtype), 16)
@@ -471,12 +451,8 @@ def _make_table(part: FrameTest, leaves: Mapping[str, Leaf], size: int) -> _Look
 def _find_bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
     """Return the bits on which a condition depends, and the values that make it true.
 
-    Args:
-        listed: for each value of the table, whether the condition is true.
-
     Returns:
-        A mask of the bits, and one or two values of the masked bits. None if there are more than
-        two such values, or none.
+        A mask of the bits, and one or two values of the masked bits; else None.
     """
     values = np.arange(len(listed))
     mask = sum(
@@ -491,10 +467,7 @@ def _find_bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
 
 
 def _find_window(leaves: Iterable[Leaf]) -> tuple[int, int]:
-    """Return the start and the end of the byte range that contains the fields.
-
-    If a field is in an array, its first element counts.
-    """
+    """Return the start and the end of the byte range that contains the fields."""
     spans = [leaf.byte_span for leaf in leaves]
     if spans:
         return (min(start for start, _ in spans), max(stop for _, stop in spans))

@@ -1,11 +1,7 @@
 """Check frames at equal distances as the rows of an array, without a search.
 
-In a stream without errors, each frame begins directly after the previous one. Datagrams of one size
-are at equal distances in a capture or an array. If all of them are frames of one layout, and no
-type that is declared earlier matches at their first bytes, the search would accept the same frames.
-They are therefore checked as rows, which takes a few calls of NumPy. In a stream, the search
-continues at the first invalid row. Either all datagrams are checked as rows, or none. Rows of a
-weak type are accepted only if they continue a run of frames of this type.
+In a stream without errors, each frame begins directly after the previous one. Such frames are
+checked as rows, which takes a few calls of NumPy. The result is the same as that of the search.
 """
 
 from __future__ import annotations
@@ -74,8 +70,7 @@ def find_regular_datagrams(
 ) -> Frames | None:
     """Check datagrams at equal distances as frames of one type and layout.
 
-    Returns None if this is not possible, because the datagrams differ in size, lack constants of
-    the type, have the constants of a type that is declared earlier, or change the active types.
+    Returns None if the datagrams differ in size, type or layout.
     """
     rows = _view_rows(buffer, starts, sizes)
     if rows is None:
@@ -97,7 +92,6 @@ def check_rows(
 
     Args:
         kind: the index of the type, whose constants match in all rows.
-        rows: the rows, which are at equal distances in the buffer.
         first: the offset of the first row in the buffer.
     """
     survey = framing.codecs[kind].survey_rows(rows, sums=framing.sums)
@@ -146,10 +140,7 @@ def find_common_step(starts: Indices) -> int:
 
 
 def _make_result(framing: Framing, mode: SearchState, frames: Frames) -> PieceResult:
-    """Return the result for a piece, given the frames at the start of the piece.
-
-    All bytes after these frames have to be searched again.
-    """
+    """Return the result for a piece, given the frames at the start of the piece."""
     end = len(frames) * mode.size
     rest = frames.buffer[end:]
     need = 0
@@ -163,7 +154,7 @@ def _count_needed(
 ) -> int:
     """Return how many bytes of an incomplete frame are needed to check it further.
 
-    Returns 0 if the type and the layout are not certain, or if a constant is wrong.
+    Returns 0 if the number is unknown.
     """
     first = next(
         (other for other in framing.active_types(mode) if _begins_with(framing.marks[other], rest)),
@@ -186,10 +177,7 @@ def _begins_with(marks: Marks, data: bytes) -> bool:
 
 
 def _view_rows(buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices) -> Bytes2D | None:
-    """Return datagrams of one size at equal distances as rows of an array.
-
-    Returns None if sizes or distances differ.
-    """
+    """Return datagrams as rows of an array; None if sizes or distances differ."""
     count = len(sizes)
     size = sizes.item(0) if count else 0
     if not size or (broadcast_value(sizes) is None and np.count_nonzero(sizes == size) < count):
@@ -204,11 +192,7 @@ def _view_rows(buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices) -> By
 
 
 def _guess_type(framing: Framing, rows: Bytes2D, mode: SearchState) -> int | None:
-    """Return the type whose constants are in the first datagram.
-
-    Returns None if there is no such type, or if a datagram has the constants of a type that is
-    declared earlier.
-    """
+    """Return the type whose constants are in the first datagram, or None."""
     first = rows[0].tobytes()
     before = list[int]()
     for kind in framing.active_types(mode):
@@ -224,12 +208,7 @@ def _guess_type(framing: Framing, rows: Bytes2D, mode: SearchState) -> int | Non
 
 
 def _may_have_constants(framing: Framing, kind: int, other: int, rows: Bytes2D) -> bool:
-    """Return whether a row has the constants of the type `kind`.
-
-    Args:
-        kind: the index of the type.
-        other: the index of the type whose constants are in the first row.
-    """
+    """Return whether a row has the constants of the type `kind`."""
     if are_contradictory(framing.marks[kind], framing.marks[other]):
         return False
     marked = match_constants(framing.words[kind], rows)

@@ -1,9 +1,7 @@
 """The results of framing: `Frames`, many frames as arrays; `Found`, one frame; `Counters`.
 
-`Frames` is passed from step to step. The codec of a frame type checks candidates and finds their
-layouts, the search accepts some of them, and the decoder adds their offsets in the input and their
-arrival times. Frames of one size at equal distances are described by a few numbers. Making arrays
-from these numbers takes longer than finding the frames, so each array is made when it is first
+The codec of a frame type checks candidates, the search accepts some of them, and the decoder adds
+their offsets in the input and their arrival times. Each array of `Frames` is made when it is first
 read.
 """
 
@@ -120,10 +118,7 @@ class Counters:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.compare}
 
     def count_error(self, failure: PluginError, number: int) -> None:
-        """Count packets for which a function of the plugin raised an error.
-
-        The first few errors are kept.
-        """
+        """Count packets for which a function of the plugin raised an error."""
         self.plugin_errors += number
         if len(self.failures) < 5:
             self.failures.append(failure)
@@ -137,9 +132,6 @@ class Counters:
         """Return the first error of a plugin; the message has the number of all errors.
 
         Returns None if there was no error.
-
-        Args:
-            sensor: the id of the sensor, for the message.
         """
         if not self.failures:
             return None
@@ -213,8 +205,8 @@ class Frames:
         offsets: the offset of each frame in the whole input. Datagrams count as if they were
             joined.
         places: the same offsets, as a range if the frames have one size and follow one another.
-        rows: the bytes of each frame as a row, if all have one layout and the rows were gathered.
-            Incomplete candidates, which are the last candidates, have no rows.
+        rows: the bytes of each complete frame as a row, if all have one layout and the rows were
+            gathered.
         errors: the errors of the plugin.
     """
 
@@ -371,9 +363,6 @@ class Frames:
         at: NDArray[np.int64],
     ) -> Frames:
         """Return these frames with their offsets in the input and their arrival times.
-
-        If the bytes of the frames were gathered to `rows`, the rows replace the buffer, so that its
-        memory can be freed.
 
         Args:
             names: the names of the frame types, as in `Frames`.

@@ -2,14 +2,11 @@
 
 The leftmost valid candidate is accepted, and the search continues after its last byte. After an
 invalid candidate, the search continues at the next byte. If several types match at one offset, the
-type that is declared first is used. A type with `after` is active only if its `after` names the
-type of the last frame that changed the active types. Frames of a type that no `after` names do not
-change the active types. Frames of a type with `confirm` are accepted only in runs without gaps
-(`lidarspec.framing.weak_frames`).
+type that is declared first is used. A type with `after` is searched only while it is active. A type
+with `confirm` is accepted only in runs without gaps (`lidarspec.framing.weak_frames`).
 
-All candidates of a piece are checked together. They are accepted together up to the next overlap of
-two candidates, or up to the next frame that changes the active types. The time is therefore linear
-in the size of the input. The result is the same as that of a search byte by byte.
+All candidates of a piece are checked together, so the time is linear in the size of the input. The
+result is the same as that of a search byte by byte.
 """
 
 from __future__ import annotations
@@ -126,8 +123,7 @@ class _FrameWalk:
 
         Args:
             position: the offset to start from.
-            piece: the result for the piece. If the search ends at an incomplete candidate, the
-                attributes `end`, `is_waiting` and `need` of the result are set.
+            piece: the result for the piece, which is updated.
 
         Returns:
             The end of the last accepted frame, or of the piece.
@@ -188,7 +184,7 @@ class _FrameWalk:
     def _continue_run(self, position: int) -> int:
         """Extend the run that ends at `position`, and return the new end of the run.
 
-        Returns `position` if no run ends there, or if the run does not continue.
+        Returns `position` if no run continues there.
         """
         if self._mode.run_end != self._base + position:
             return position
@@ -226,11 +222,7 @@ def _list_rows(runs: Offsets) -> Offsets:
 
 
 def _remember_size(mode: SearchState, frames: Frames, since: int) -> None:
-    """Store the size of the frames, and whether they follow one another without gaps.
-
-    Args:
-        since: the offset at which the active types last changed; earlier frames are ignored.
-    """
+    """Store the size of the frames, and whether they follow one another without gaps."""
     own = frames.starts[frames.starts.searchsorted(since) :]
     if len(own):
         mode.size = frames.sizes.item(-1)
@@ -244,8 +236,6 @@ def count_rejected(
     stays: list[tuple[int, str | None]],
 ) -> None:
     """Count the rejected candidates outside of accepted frames.
-
-    A failure of the plugin at the first byte of an accepted frame is also counted.
 
     Args:
         stays: pairs of an offset and the value of `SearchState.after` after this offset.

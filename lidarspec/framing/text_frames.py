@@ -1,7 +1,7 @@
 """The codec of frames with a wire form, such as text or escaped bytes.
 
 The wire form finds the end of each candidate and decodes it to the bytes of the struct, one
-candidate at a time. The structs are grouped by layout and checked together, as for binary frames.
+candidate at a time. The structs are then checked together.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class TextCodec(Codec):
         stops: NDArray[np.intp],
         errors: list[PluginError],
     ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        """Return the size of the frame at each offset, and for which of them the plugin failed.
+        """Return the size of each frame, and whether the plugin failed for it.
 
         The size is `NO_END` or `NO_FRAME` if there is none.
         """
@@ -109,10 +109,8 @@ class TextCodec(Codec):
         """Check complete candidates; equal candidates are decoded once.
 
         Args:
-            frames: all candidates.
             which: the indices of the candidates to check.
             status: the status of all candidates, which is updated.
-            errors: errors of the plugin are added to this list.
         """
         decode = functools.lru_cache(MAX_REMEMBERED)(functools.partial(self._decode, errors=errors))
         structs = dict[int, bytes]()
@@ -138,8 +136,7 @@ class TextCodec(Codec):
     def _decode(self, data: bytes, errors: list[PluginError]) -> tuple[int, bytes | None]:
         """Decode a complete candidate; return its status and its struct.
 
-        If the struct is not None, the caller has to check it, and the returned status is
-        preliminary.
+        If the struct is not None, the caller has to check it.
         """
         try:
             decoded = self._coder.decode_whole(data)
@@ -161,11 +158,7 @@ class TextCodec(Codec):
     def _group_by_layout(
         self, structs: Sequence[bytes]
     ) -> tuple[list[LayoutRows], list[tuple[LayoutRefusal, NDArray[np.intp]]]]:
-        """Group structs by layout; return the groups and the refused structs.
-
-        Refused structs are given as pairs of a refusal and the indices of the structs. A struct is
-        left out if its size differs from the size of its layout.
-        """
+        """Group structs by layout; return the groups and the refused structs."""
         sizes = np.array([len(struct) for struct in structs], np.intp)
         starts = np.cumsum(sizes) - sizes
         joined = np.frombuffer(b"".join(structs), np.uint8)

@@ -1,20 +1,11 @@
 """Check candidates of many lengths together.
 
-If random bytes look like a header, they can contain any length. A noisy stream can therefore have
-candidates of hundreds of layouts, with one or two candidates each. Checking the candidates of a
-layout takes a few dozen NumPy calls, for one candidate as for a thousand.
+Random bytes that look like a header can contain any length. A noisy stream can therefore have
+candidates of hundreds of layouts, and checking each layout alone would be slow.
 
-Most of these layouts differ only in the length of an array at their end. They have the same
-constants and tests of the same fields. Their checksums cover the bytes from the same offset to the
-same distance from the end. `LayoutFamilies` finds such layouts, and their candidates become the
-rows of one array, which are as long as the longest candidate.
-
-Before a checksum is computed, the bytes after the covered bytes move to the end of the row, and
-the gap is filled with zeros. This does not change the result of the algorithms in `ZERO_EXTENDED`.
-A test ignores array elements after the end of a candidate.
-
-The results are the same as those of `plausibility.CandidateChecker`. That class also does all tests
-that are not a lookup of one or two bytes.
+`LayoutFamilies` finds layouts that differ only in the length of an array at their end. The
+candidates of these layouts become the rows of one array, which are as long as the longest
+candidate. The results are the same as those of `plausibility.CandidateChecker`.
 """
 
 from __future__ import annotations
@@ -70,10 +61,7 @@ class LayoutFamily:
 
 
 class LayoutFamilies:
-    """The families of the layouts of a frame type.
-
-    The layouts of a family differ only in the length of an array.
-    """
+    """The families of the layouts of a frame type."""
 
     def __init__(self) -> None:
         self._numbers: dict[Hashable, int] = {}
@@ -106,10 +94,7 @@ class LayoutFamilies:
         return together, left
 
     def find_family(self, layout: Layout, checker: CandidateChecker) -> LayoutFamily | None:
-        """Return the family of a layout.
-
-        Returns None if candidates of this layout cannot be checked together with other candidates.
-        """
+        """Return the family of a layout; None if its candidates must be checked alone."""
         if self not in layout.notes:  # decoders of one frame type share its layouts
             layout.notes[self] = self._find(layout, checker)
         family: LayoutFamily | None = layout.notes[self]
@@ -145,10 +130,7 @@ def _make_seal_key(seal: Seal, size: int) -> Hashable:
 
 
 def _find_checksum_position(leaf: Leaf, seal: Seal, size: int) -> tuple[str, int]:
-    """Return the position of a checksum, counted from the start or the end of the frame.
-
-    It is counted from the end if the checksum is after the last covered byte.
-    """
+    """Return the position of a checksum, counted from the start or the end of the frame."""
     if leaf.offset >= seal.spans[-1][1]:
         return ("end", size - leaf.offset)
     return ("start", leaf.offset)
@@ -224,10 +206,7 @@ class JointChecker:
     def _check_rows(
         self, rows: Bytes2D, sizes: Offsets, forms: Offsets, longest: int, sums: Sums | None
     ) -> Status:
-        """Check candidates in rows of the longest layout, and return their status, (n,).
-
-        Bytes after the end of a candidate are ignored.
-        """
+        """Check candidates in rows of the longest layout, and return their status, (n,)."""
         checker = self._make_checker(self.layouts[longest])
         status = np.zeros(len(rows), np.uint8)
         checker.check_constants(status, rows)
@@ -249,11 +228,7 @@ def _find_length(check: Check) -> int:
 
 
 def _iter_by_size(sizes: Offsets) -> Iterator[Offsets]:
-    """Yield the indices of candidates in groups of similar size.
-
-    The indices in a group are sorted by size. All rows of a group together have at most
-    `BLOCK_BYTES`.
-    """
+    """Yield the indices of candidates in groups of similar size."""
     order = np.argsort(sizes, kind="stable")
     ordered = sizes[order]
     start = 0
@@ -286,9 +261,9 @@ def _have_valid_checksums(
         seal: the checksum in the longest layout.
         rows: the candidates, in rows of the size of the longest layout.
         sizes: the sizes of the candidates, (n,).
-        sums: a function that computes checksums.
     """
     # The bytes after the covered bytes, such as the stored checksum, move to the end of the row.
+    # Zeros fill the gap. They do not change the result of the algorithms in `ZERO_EXTENDED`.
     size = rows.shape[1]
     tail = size - seal.spans[-1][1]
     stops = sizes - tail

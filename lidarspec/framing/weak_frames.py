@@ -1,16 +1,11 @@
 """Weak frame types, which are accepted only in runs of consecutive frames.
 
-For example, a frame of five bytes without a checksum may be valid at every sixth offset of random
-bytes. Frames of a type with `confirm=k` are therefore accepted only if at least k valid frames
-follow one another without a gap. The whole run is then accepted.
+Frames of a type with `confirm=k` are accepted only if at least k valid frames follow one another
+without a gap. The whole run is then accepted. For example, a frame of five bytes without a checksum
+may be valid at every sixth offset of random bytes.
 
-Weak candidates are checked like all others, and this module then selects the runs. The next frame
-of a run is the candidate that begins directly after the last byte of a candidate, unless a frame of
-a type that is declared earlier begins there. The first candidate of a run of at least k frames is
-called a head. If a run reaches the end of the bytes, its first candidate may become a head, and
-waits for more bytes. The search handles a head like any other candidate, with the end of the run as
-its end, so it skips the other frames of the run. If a run was accepted in the previous piece, any
-valid candidate directly after it continues the run.
+The first candidate of a run of at least k frames is called a *head*. The search handles a head as
+one candidate, with the end of the run as its end.
 """
 
 from __future__ import annotations
@@ -31,9 +26,8 @@ class WeakRuns:
 
     Attributes:
         frames: the n candidates of the type that are valid or incomplete, sorted by offset.
-        following: for each candidate, the row of the next candidate in its run, (n + 2,). It is n
-            if the run ends, and n + 1 if this depends on bytes after the piece. The last two
-            elements are n and n + 1.
+        following: for each candidate, the row of the next candidate in its run; n if the run ends,
+            n + 1 if more bytes are needed to know, (n + 2,).
         confirm: the minimum length of a run that is accepted.
         is_single: whether a frame of the type changes the active types, so that frames have to be
             accepted one at a time.
@@ -54,10 +48,7 @@ class WeakRuns:
 
     @cached_property
     def heads(self) -> Frames:
-        """The candidates at which a run of at least `confirm` begins, or may begin.
-
-        Their status is `VALID` or `SHORT`.
-        """
+        """The candidates at which a run of at least `confirm` begins, or may begin."""
         count = len(self.frames)
         rows = np.arange(count)
         for _ in range(self.confirm - 1):
@@ -87,11 +78,7 @@ class WeakRuns:
 
     @cached_property
     def _jumps(self) -> list[Indices]:
-        """Arrays with the row that is 1, 2, 4, 8 ... frames later in the run of each row.
-
-        The shape of an array is (n,). If a run is too short, the array has the last row of the run.
-        The last array has the last row of every run.
-        """
+        """Arrays with the row that is 1, 2, 4, 8 ... frames later in the run of each row."""
         count = len(self.frames)
         rows = np.arange(count)
         further = self.following[:count]
@@ -126,6 +113,8 @@ def find_runs(
             accepted one at a time.
         final: whether no bytes follow, so that incomplete candidates are invalid.
     """
+    # The next frame of a run begins directly after the last byte of a frame. If a frame of an
+    # earlier type begins there, the run ends.
     frames = candidates.select(candidates.status <= (VALID if final else SHORT))
     is_short = frames.status == SHORT
     count = len(frames)
