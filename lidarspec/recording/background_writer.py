@@ -1,9 +1,7 @@
-"""Write records to a file in a thread.
+"""Write records to a file in a thread, so that a slow disk does not delay the capture.
 
-A slow disk therefore does not delay the capture. Records wait in memory. The thread writes them
-every 0.2 s, or when there are 64 KiB, and calls fsync every second. An existing file is kept until
-the new file has its first record. If the disk is full, a partly written record is removed, so that
-the file ends after a complete record.
+The thread calls fsync every second. An existing file is kept until the new file has its first
+record. The file always ends after a complete record.
 """
 
 from __future__ import annotations
@@ -46,8 +44,7 @@ class RecordingFile:
 
     Args:
         path: the path of the file.
-        size_at: a function that returns the length of a record, so that the file can be truncated
-            after the last complete record if a write was partial. None if the file has no records,
+        size_at: a function that returns the length of a record; None if the file has no records,
             only bytes.
         overwrite: whether an existing file may be replaced.
 
@@ -110,11 +107,7 @@ class RecordingFile:
         return self._opened == self._place
 
     def settle(self) -> None:
-        """Give the file its final name, which replaces an existing file.
-
-        Raises:
-            OSError: if the replacement fails.
-        """
+        """Give the file its final name, which replaces an existing file."""
         if not self.is_settled:
             os.replace(self._opened, self._place)
             self._opened = self._place
@@ -288,8 +281,7 @@ class BackgroundWriter:
 
         Args:
             record: the bytes of the record.
-            size: number of data bytes to add to `bytes`; None for a header or event, which is not
-                counted.
+            size: number of data bytes to add to `bytes`; None for a header or event.
         """
         with self._changed:
             if self.error or self._closing or len(self._waiting) + len(record) > MAX_WAITING_BYTES:
@@ -325,10 +317,7 @@ class BackgroundWriter:
         atexit.unregister(self._finish)
 
     def _write_records(self) -> None:
-        """Write the waiting records until the recorder is closed or an error occurs.
-
-        This runs in the thread.
-        """
+        """Write the waiting records until the recorder is closed or an error occurs."""
         try:
             due = time.monotonic() + SYNC_PERIOD_S
             while not (

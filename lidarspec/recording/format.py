@@ -20,15 +20,9 @@ An event is a JSON object. Its entry "event" is "disconnect", "reconnect", "drop
 was set; "ahead_ns" is the wall clock minus the arrival times, which continue without a jump.
 Readers skip unknown kinds of records.
 
-Theory of operation: A length field has one or two bytes, so no record is longer than 66 kB. A
-record is used only if its checksum is valid. The reader keeps a part of the file in memory: one
-record and the rest of the last block. It stops at the first damaged record, or continues with the
-next valid record (`salvage`). If the recording process is killed, the file ends with at most one
-incomplete record.
-
-`Recording.seek` finds a time by bisection, without an index that a crash could destroy. This is
-possible because arrival times never decrease, and because a record can be found from any offset: it
-begins at the next mark with a valid checksum.
+A record is used only if its checksum is valid. The reader stops at the first damaged record, or
+continues with the next valid record (`salvage`). If the recording process is killed, the file ends
+with at most one incomplete record.
 """
 
 from __future__ import annotations
@@ -311,6 +305,8 @@ class Recording(ClosingContext):
         Returns:
             Whether records were skipped; always False for a pipe or without arrival times.
         """
+        # Bisection needs no index, which a crash could destroy. Arrival times never decrease, and a
+        # record can be found from any offset: it begins at the next mark with a valid checksum.
         here = low = self.offset
         if not self._file.seekable():
             return False
@@ -327,10 +323,7 @@ class Recording(ClosingContext):
         return low > here
 
     def _find_received(self, start: int, stop: int) -> tuple[int, int] | None:
-        """Return the time and offset of the first received record between two offsets.
-
-        Records without a time are ignored.
-        """
+        """Return the time and offset of the first received record between two offsets."""
         self._move_to(start)
         while self.offset < stop and self._fill_window(1):
             size = self._find_valid_length()
@@ -476,9 +469,9 @@ def _pack_endpoint(address: Address | None) -> bytes:
 
 @lru_cache(maxsize=256)
 def _read_endpoints(data: bytes) -> list[Address | None] | None:
-    """Return the sender and the receiver in the address bytes of a record.
+    """Return the sender and the receiver of a record; None for invalid bytes.
 
-    An unknown address is None. If the bytes are invalid, the result itself is None.
+    An unknown address is None.
     """
     addresses: list[Address | None] = []
     offset = 0

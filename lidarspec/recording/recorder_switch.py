@@ -24,8 +24,7 @@ class RecordingSwitch:
         folder: the folder of the files.
 
     Attributes:
-        trouble: a message if the last call could not start or end a file, or if the file that it
-            ended was empty; else "".
+        trouble: a message if the last call failed or ended an empty file; else "".
         written: (path, number of data bytes) of each closed file.
     """
 
@@ -45,10 +44,7 @@ class RecordingSwitch:
         return self
 
     def toggle(self) -> None:
-        """Start or end a recording.
-
-        The file is named after the sensor and the time.
-        """
+        """Start or end a recording."""
         with self._changing:
             self._change(on=self._recorder is None)
 

@@ -1,8 +1,7 @@
 """Recorders: write received and sent data to a file while it is captured.
 
 The suffix of the file selects the format: .lsr for all data, .pcap and .pcapng for packets that
-Wireshark can open, .bin for raw bytes. A thread appends complete records to the file
-(`background_writer`).
+Wireshark can open, .bin for raw bytes.
 """
 
 from __future__ import annotations
@@ -206,10 +205,7 @@ class FrameRecorder(BackgroundWriter):
             self._write_frames(self._decoder.feed(chunk.data, self._at))
 
     def _write_frames(self, frames: list[Found]) -> None:
-        """Write frames, and the received bytes outside these frames, in order.
-
-        Bytes that may belong to an incomplete frame are kept for the next call.
-        """
+        """Write frames, and the received bytes outside these frames, in order."""
         for item in frames:
             self._write_gap(item.offset - self._base)
             self._write_packet(len(item.data), item.at or self._at)
@@ -364,14 +360,7 @@ def _make_event(name: str, at: int, details: dict[str, Any]) -> bytes:
 
 
 def _record_size(data: bytes | bytearray, at: int) -> int:
-    """Return the length of the record at an offset.
-
-    The magic bytes at the start of a recording count as a record.
-
-    Args:
-        data: a piece of a recording.
-        at: the offset in the piece.
-    """
+    """Return the length of the record at an offset."""
     if data.startswith(MAGIC, at):
         return len(MAGIC)
     return size_at(data, at)
