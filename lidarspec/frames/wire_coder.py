@@ -210,15 +210,23 @@ class FormCoder(Coder):
             known = self.decode(spelling)
             if known.problem is None and known.struct == struct:
                 return spelling
+        data = self.encode_unchecked(struct)
+        if data is not None:
+            decoded = self.decode(data)
+            if decoded.problem is None and decoded.struct == struct:
+                return data
+        return None
+
+    def encode_unchecked(self, struct: bytes) -> bytes | None:
+        """Return the bytes that the wire form sends for a struct, even if they are invalid.
+
+        Returns None if the struct has no layout.
+        """
         layout = self.tree.find_node(struct, is_whole_frame=True).result
         if not isinstance(layout, Layout) or layout.size != len(struct):
             return None
         with _form_errors(self.form.encode):
-            data = bytes(self.form.encode(struct, list_runs(layout)))
-        decoded = self.decode(data)
-        if decoded.problem is None and decoded.struct == struct:
-            return data
-        return None
+            return bytes(self.form.encode(struct, list_runs(layout)))
 
     def keep_spelling(self, values: Any, struct: bytes, data: bytes) -> Any:
         if self.encode(struct) != data:

@@ -92,6 +92,8 @@ LS310 the checksum misses a flipped bit | damaged frames are accepted | use a ch
 LS311 two examples with the same seed differ | a failure cannot be reproduced | use no random values and no clock
 LS312 a field that `Rebuild` fills in is not checked | a frame with another value is accepted, and built differently
       | compare it in `plausible`: f.length == f.size + 5
+LS313 a wire form cannot send the first bytes of a frame as content | frames with this content are lost
+      | escape these bytes in `encode`, and undo it in `decode`
 LS401 a clean stream loses bytes | valid frames are lost without any damage | declare all parts of the frames
 LS404 scans depend on the size of batches | the same revolution is cut at another place | keep no state in `points`
 LS414 a function of the plugin raises an error | its packets are counted, but lost | make it valid for every valid frame

@@ -19,6 +19,8 @@ from lidarspec.errors import SpecError, UsageError, WireError
 from lidarspec.explaining.damage_search import find_changes
 from lidarspec.explaining.explanation import is_valid_frame
 from lidarspec.frames.layout import Layout
+from lidarspec.frames.wire_coder import FormCoder, frame_coder
+from lidarspec.framing.example_frames import valid_mask
 from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.framing.results import VALID
 from lidarspec.spec.tree import FieldInfo
@@ -202,6 +204,41 @@ def is_cut(before: Any, after: Any) -> bool:
     if isinstance(before, int):
         return after == before - 1
     return before - after < 0.1 * abs(before) + 1
+
+
+def the_start_of_a_frame_may_be_content(subject: SensorUnderTest, name: str) -> None:
+    """Check that a wire form of bytes can send the first bytes of a frame in its fields."""
+    frame = subject.sensor.frames[name]
+    coder = frame_coder(frame)
+    if not isinstance(coder, FormCoder) or coder.form.is_text or not coder.begins:
+        return
+    start = np.frombuffer(coder.begins, np.uint8)
+    struct = coder.decode(subject.example(name)).struct
+    layout = coder.tree.find_node(struct).result
+    assert isinstance(layout, Layout)
+    offsets = range(len(struct) - len(start) + 1)
+    rows = np.repeat(np.frombuffer(struct, np.uint8)[None], len(offsets), axis=0)
+    for row, offset in zip(rows, offsets, strict=True):
+        row[offset : offset + len(start)] = start
+    layout.seal(rows)
+    is_valid = valid_mask(subject.sensor, name, layout, rows)
+    for row, offset in zip(rows[is_valid], np.flatnonzero(is_valid).tolist(), strict=True):
+        if not np.array_equal(row[offset : offset + len(start)], start):
+            continue  # constants, lengths or checksums are there
+        content = row.tobytes()
+        if coder.tree.find_node(content).result is not layout:
+            continue  # a length, or the end of a text
+        data = coder.encode_unchecked(content)
+        if data is None or len(data) > frame.max_length:
+            continue
+        decoded = coder.decode(data)
+        require(
+            decoded.problem is None and decoded.struct == content,
+            "LS313",
+            f"the frame {data.hex(' ')} contains {coder.begins.hex(' ')} as content, and is not"
+            " decoded to the values that it was built from",
+            name,
+        )
 
 
 def values_in_units_build_the_same_bytes(subject: SensorUnderTest, name: str) -> None:

@@ -167,6 +167,12 @@ PROPERTIES = (
     Property(
         frames.values_survive_building_and_parsing, "frame", "LS305", unless=("LS302", "LS303")
     ),
+    Property(
+        frames.the_start_of_a_frame_may_be_content,
+        "frame",
+        "LS313",
+        unless=("LS301", "LS302", "LS303"),
+    ),
     Property(frames.parse_finds_out_the_type, "frame", "LS306"),
     Property(frames.a_truncated_frame_is_a_wire_error, "frame", "LS307"),
     Property(frames.a_damaged_frame_is_at_worst_a_wire_error, "frame", "LS308"),

@@ -141,3 +141,45 @@ def test_a_broken_wire_form_does_not_stop_other_sensors(
     nearest = identification.find_nearest_fault(frames[0][:-1] + b"?")
     assert nearest is not None
     assert nearest.sensor == "ldrobot-ld06"
+
+
+@dataclass(frozen=True)
+class Marked(WireForm):
+    """Two marks, the number of further bytes, and the struct, in which marks may be doubled."""
+
+    is_stuffed: bool
+
+    def begins(self, texts: object) -> bytes:
+        return b"\xa5\x5a"
+
+    def find_end(self, data: bytes) -> int:
+        if not b"\xa5\x5a".startswith(data[:2]):
+            return -1
+        if len(data) < 3 or len(data) < 3 + data[2]:
+            return 0
+        return 3 + data[2]
+
+    def decode(self, data: bytes, next_runs: object) -> Decoded:
+        if b"\xa5\x5a" in data[3:].replace(b"\xa5\xa5", b""):
+            return Decoded(b"", [], 3, Problem(3, "a frame begins within this frame"))
+        offsets = [3]
+        while offsets[-1] < len(data) - 1:
+            is_doubled = data[offsets[-1]] == 0xA5 and self.is_stuffed
+            offsets.append(offsets[-1] + 1 + is_doubled)
+        offsets = [offset for offset in offsets if offset < len(data)]
+        struct = bytes(data[offset] for offset in offsets)
+        return Decoded(struct, [(np.array(offsets), np.ones(len(offsets), int))], len(data))
+
+    def encode(self, struct: bytes, runs: Sequence[TextRun | NumberRun]) -> bytes:
+        body = struct.replace(b"\xa5", b"\xa5\xa5") if self.is_stuffed else struct
+        return b"\xa5\x5a" + bytes([len(body)]) + body
+
+
+@pytest.mark.parametrize("is_stuffed", [True, False])
+def test_check_sends_the_start_of_a_frame_as_content(is_stuffed: bool) -> None:
+    frame = Frame(Struct("id" / Int8ub, "value" / Int16ub), max_length=20, wire=Marked(is_stuffed))
+    (report,) = iter_reports(
+        CheckTarget([replace(SENSOR, frames={"state": frame})]), SENSOR.id, examples=4
+    )
+    expected = [] if is_stuffed else ["LS313"]
+    assert [finding.code for finding in report.findings] == expected
