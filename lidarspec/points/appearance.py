@@ -1,7 +1,6 @@
-"""Choose how to draw a cloud: its extent, and the values that its colours show.
+"""Choose the extent of a drawn cloud, and the values that its colours show.
 
-All drawings use this module, so that a scan looks the same in a terminal, on paper and in other
-tools.
+All drawings use this module, so that a scan looks the same in every tool.
 """
 
 from __future__ import annotations
@@ -52,8 +51,7 @@ class CloudAppearance:
         reach: the distance from the middle of the picture to its nearer edge, metres.
         full: the value with the last colour, in metres for ranges, else in `unit`.
         middle: the point in the middle of the picture, metres forward and left of the sensor.
-        flat: whether all points are in the plane of the sensor, so that only a view from above is
-            useful.
+        flat: whether all points are in the plane of the sensor.
         low: the value with the first colour.
         unit: the unit of the values; "" for ranges and plain numbers.
     """
@@ -85,11 +83,9 @@ def choose_appearance(
 ) -> CloudAppearance:
     """Return how to draw a cloud so that all of it is visible.
 
-    If `ramp` is "intensity" and the cloud has no intensity, the colours show the range.
-
     Args:
         points: the cloud.
-        ramp: the column that the colours show.
+        ramp: the column that the colours show; the range if the cloud has no intensity.
         reach: the distance from the middle to the nearer edge, metres; None to fit the cloud.
 
     Raises:
@@ -127,11 +123,8 @@ def is_flat(cloud: PointCloud) -> bool:
 
 
 def find_reach(cloud: PointCloud) -> float:
-    """Return the range to draw for a cloud of valid points, metres, rounded up.
-
-    This is the range of the farthest point. If a few points are much farther than the others, it is
-    a percentile of the ranges.
-    """
+    """Return the range to draw for a cloud of valid points, metres, rounded up."""
+    # A few points that are much farther away than all others do not count.
     if not len(cloud):
         return 1.0
     distance = np.hypot(cloud.x, cloud.y)
@@ -141,10 +134,8 @@ def find_reach(cloud: PointCloud) -> float:
 
 
 def fit_to_points(points: PointCloud, look: CloudAppearance) -> CloudAppearance:
-    """Return a copy of `look` in which the central 98 % of the points fill a top view.
-
-    The picture is extended to the sensor if this makes the points at most 7 % smaller.
-    """
+    """Return a copy of `look` in which the central 98 % of the points fill a top view."""
+    # The sensor is included if this makes the points at most 7 % smaller.
     low, high = find_bounds(points[points.valid])
     with_sensor = np.minimum(low, 0.0), np.maximum(high, 0.0)
     if _half_extent(low, high) >= MIN_SIZE_SHARE * _half_extent(*with_sensor):
@@ -156,14 +147,13 @@ def fit_to_points(points: PointCloud, look: CloudAppearance) -> CloudAppearance:
 
 
 def find_bounds(cloud: PointCloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the lowest and the highest x, y and z of the central points.
+    """Return the lowest and the highest x, y and z of the central 98 % of the points.
 
     Args:
         cloud: valid points.
 
     Returns:
-        Two arrays (3,) in metres, zeros if there are no points. The outermost 2 % of the points may
-        be outside these bounds.
+        Two arrays (3,) in metres, zeros if there are no points.
     """
     if not len(cloud):
         return np.zeros(3), np.zeros(3)
@@ -193,17 +183,14 @@ def round_up(value: float, rounds: Sequence[float] = ROUND_NUMBERS) -> float:
 
 
 def ring_step(reach: float) -> float:
-    """Return the distance between range rings, metres: 1, 2 or 5 times a power of ten.
-
-    At most four rings are within `reach`.
-    """
+    """Return the distance between range rings, metres: 1, 2 or 5 times a power of ten."""
     return round_up(reach / MAX_RINGS, (1, 2, 5, 10))
 
 
 def ramp_positions(cloud: PointCloud, look: CloudAppearance) -> NDArray[np.float64]:
-    """Return the position of each point on the colour scale, (n,), from 0 to 1.
+    """Return the position of each point on the colour scale, (n,), from 0.
 
-    Values beyond the last colour have positions above 1.
+    The last colour is at 1. Larger values have positions above 1.
     """
     if look.ramp == "range":
         return np.hypot(cloud.x, cloud.y).astype(np.float64) / look.full
@@ -211,10 +198,7 @@ def ramp_positions(cloud: PointCloud, look: CloudAppearance) -> NDArray[np.float
 
 
 def ramp_indices(cloud: PointCloud, look: CloudAppearance) -> NDArray[np.intp]:
-    """Return the index of the colour of each point, (n,).
-
-    Points without a return have the first colour.
-    """
+    """Return the index of the colour of each point, (n,)."""
     return np.clip(
         np.nan_to_num(ramp_positions(cloud, look)) * RAMP_STEPS, 0, RAMP_STEPS - 1
     ).astype(np.intp)

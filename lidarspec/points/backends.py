@@ -1,7 +1,7 @@
 """Choose the back end that computes columns: NumPy or compiled kernels.
 
-Loading Numba and compiling a kernel take about a second. The back end "auto" uses a kernel only
-after enough points were computed to save this time.
+Loading Numba and compiling a kernel take about a second. The back end "auto" uses a kernel after
+enough points were computed to save this time.
 """
 
 from __future__ import annotations
@@ -44,11 +44,7 @@ def choose_maker(plan: Plan, names: tuple[str, ...], backend: str, frames: int) 
 
 
 def _find_faster_kernel(plan: Plan, names: tuple[str, ...], frames: int) -> ColumnMaker | None:
-    """Return a kernel if it saves time, which requires many points.
-
-    The function counts the points. Returns None if a kernel saves no time, or if Numba is missing
-    or fails.
-    """
+    """Count the points, and return a kernel if it saves time, else None."""
     counts = _POINT_COUNTS.setdefault(plan.function, {})
     counts[names] = counts.get(names, 0) + frames * plan.width
     if counts[names] < MIN_WARM_KERNEL_POINTS:

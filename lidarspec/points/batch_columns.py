@@ -1,9 +1,7 @@
-"""The columns of the points of a batch, computed from plans when they are first read.
+"""The columns of the points of a batch, computed by plans when they are read.
 
-Columns are computed for the whole batch, for a large slice of it, or for a block of points that
-several small slices share (`BatchColumns.columns`). For each layout in the batch (`GroupPoints`), a
-program of `points.numpy_plan` or a kernel of `points.numba_kernels` computes several columns
-together (`_compute`).
+Columns are computed for the whole batch or for a large slice of it. Small slices share a block of
+points.
 """
 
 from __future__ import annotations
@@ -56,8 +54,8 @@ class BatchColumns(ColumnSource):
         shares: the packets of the batch, grouped by layout.
         size: the number of points, without the points of packets that wait for the next batch.
         base: the time that the column "time" counts from, int64 ns.
-        grids: the organisation of the points of each packet, see `ColumnSource`.
-        nominal: whether a default calibration is used, see `ColumnSource`.
+        grids: the organisation of the points of each packet.
+        nominal: whether a default calibration is used.
     """
 
     def __init__(
@@ -124,10 +122,7 @@ class BatchColumns(ColumnSource):
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
     def _get_block(self, index: int) -> PointBlock:
-        """Return the block that contains the point at an index; make it on first use.
-
-        Blocks do not overlap.
-        """
+        """Return the block that contains the point at an index; make it on first use."""
         place = bisect.bisect(self._blocks, index, key=lambda block: block.start)
         if place and index < self._blocks[place - 1].stop:
             return self._blocks[place - 1]
@@ -146,8 +141,8 @@ class BatchColumns(ColumnSource):
         """Compute columns of the points from `start` to `stop`.
 
         Args:
-            names: the names of the columns. If one of the columns that are compiled together is
-                requested, all of them have to be requested.
+            names: the names of the columns. Columns that are compiled together have to be requested
+                together.
         """
         main = [name for name in names if name in self._main_columns]
         sent = [name for name in names if all(name in share.plan.sent for share in self._shares)]
@@ -214,11 +209,8 @@ class BatchColumns(ColumnSource):
         }
 
     def _packet_range(self, start: int, stop: int) -> tuple[int, int | None]:
-        """Return the range of packets that contain the points from `start` to `stop`.
-
-        The range is the index of the first packet, and the index after the last packet. If the
-        batch has several layouts, the range is (0, None), which means all packets.
-        """
+        """Return the packets of the points from `start` to `stop` as (first, end)."""
+        # With several layouts, the range is (0, None), which means all packets.
         if not self._is_regular:
             return 0, None
         width = self._plan.width
@@ -230,8 +222,7 @@ class BatchColumns(ColumnSource):
         """Return a column of the points from `start` to `stop`, in stream order.
 
         Args:
-            values: for each layout, the values of all points in its packets. The packets are those
-                of `_packet_range`.
+            values: for each layout, the values of all points in the packets of `_packet_range`.
         """
         if self._is_regular:
             skipped = start % self._plan.width
@@ -246,10 +237,7 @@ class BatchColumns(ColumnSource):
     def _compute_times(
         self, share: GroupPoints, first: int, last: int | None
     ) -> NDArray[np.float64]:
-        """Return the times of the points of packets, in seconds since `base`.
-
-        The shape is (packets, *shape of the points).
-        """
+        """Return the times of points, (packets, *shape), in seconds since `base`."""
         times = self._packets.time_ns[share.group.where[first:last]]
         offsets = seconds_since(times, self.base)
         return np.asarray(
@@ -282,8 +270,7 @@ def scatter_points(
 
     Args:
         values: the values, `width` for each packet.
-        first: the index in `column` of the first point of each packet; packets with -1 are left
-            out.
+        first: the index in `column` of the first point of each packet; -1 to leave out a packet.
         width: the number of points of a packet.
         column: the array to write to.
     """
@@ -305,8 +292,6 @@ def _turn_coordinates(
     columns: dict[str, NDArray[Any]], turn: NDArray[np.float64]
 ) -> dict[str, NDArray[Any]]:
     """Return x, y and z in the vendor's axes.
-
-    Each of these axes is a REP-103 axis or its opposite.
 
     Args:
         turn: the (3, 3) matrix from REP-103 to the vendor's axes, with entries 0, 1 and -1.

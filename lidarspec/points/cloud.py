@@ -1,7 +1,6 @@
 """Point clouds: flat arrays in SI units, with REP-103 axes and REP-117 ranges.
 
-A `PointCloud` contains its columns. A `LazyCloud` computes each column when it is first read, from
-a `ColumnSource`, and keeps it. Columns that only some sensors have are in `extra`.
+A `PointCloud` contains its columns. A `LazyCloud` computes each column when it is first read.
 """
 
 from __future__ import annotations
@@ -47,8 +46,7 @@ class PointCloud:
             direction are adjacent: ``cloud.range.reshape(*cloud.shape, -1)`` is (columns, rows,
             returns).
         nominal: True if the points use a default calibration instead of the sensor's own.
-        extra: (N,) further columns of the sensor by name, for example "velocity", each of its own
-            type.
+        extra: (N,) further columns of the sensor by name, for example "velocity".
         units: the units of the columns in `extra`, by name; "" for a plain number.
         chosen: the names of the columns selected by `select_columns`; () for all columns.
     """
@@ -99,10 +97,7 @@ class PointCloud:
 
     @property
     def columns(self) -> Mapping[str, NDArray[Any]]:
-        """The columns of this cloud by name; the columns in `extra` come last.
-
-        After `select_columns`, these are only the selected columns.
-        """
+        """The selected columns of this cloud by name; by default all columns."""
         names = self.chosen or (*COLUMNS, *self.extra)
         self.load(*names)
         columns = {
@@ -115,14 +110,12 @@ class PointCloud:
         return not self.chosen or name in (*self.chosen, "x", "y", "z")
 
     def select_columns(self, *names: str) -> PointCloud:
-        """Return the same points with only these columns.
+        """Return the same points with some of their columns.
 
-        The selection applies to `columns`, `to_structured` and files. x, y and z are kept if a
-        format requires them.
+        x, y and z are kept if a file format requires them.
 
         Raises:
-            UnknownName: if the cloud does not have a column. The error lists the columns of the
-                cloud.
+            UnknownName: if the cloud does not have a column.
         """
         lacking = [
             name
@@ -138,15 +131,11 @@ class PointCloud:
         return cloud
 
     def load(self, *names: str) -> None:
-        """Compute columns together, which is faster than one after another.
-
-        Columns that are already computed and columns that the cloud does not have are ignored.
-        """
+        """Compute columns together, which is faster than one after another."""
+        # Columns that are already computed or unknown are ignored.
 
     def read(self, *names: str) -> dict[str, NDArray[Any]]:
         """Return columns by name, including "valid" and columns in `extra`.
-
-        The columns are computed together, which is faster than one after another.
 
         Raises:
             UnknownName: if the cloud does not have a column.
@@ -173,8 +162,6 @@ class PointCloud:
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
         """Return `xyz`, as NumPy, SciPy and Open3D expect points.
-
-        Use `to_structured` for the other columns.
 
         Raises:
             ValueError: with ``copy=False``, since x, y and z are separate columns.
@@ -207,8 +194,7 @@ class PointCloud:
         A missing column is filled with invalid points.
 
         Args:
-            columns: the number of columns of a revolution, and of the image. All points must be
-                from one revolution.
+            columns: the number of columns of a revolution. All points must be from one revolution.
 
         Raises:
             UsageError: if the points have no `column` or are not organised, or if a column number
@@ -239,7 +225,7 @@ class PointCloud:
     def destagger(self, shifts: Sequence[int]) -> PointCloud:
         """Return the points of an image with each row shifted by a number of columns.
 
-        Rows wrap around. The points of a column then have the same azimuth.
+        Rows wrap around. After the shift, the points of a column have the same azimuth.
 
         Args:
             shifts: the shift of each row in columns, (rows,), as in the sensor's metadata.
@@ -265,10 +251,8 @@ class PointCloud:
         )
 
     def _rearrange(self, indices: NDArray[np.intp]) -> PointCloud:
-        """Return the points at `indices`, which select whole columns.
-
-        An index of -1 gives an invalid point.
-        """
+        """Return the points at `indices`, which select whole columns."""
+        # An index of -1 gives an invalid point.
         indices = indices.reshape(-1)
         column_size = find_grid(self).column_size
         gaps = indices < 0
@@ -280,11 +264,10 @@ class PointCloud:
         return picked
 
     def to_structured(self) -> NDArray[Any]:
-        """Return a structured array (N,) with PCL's layout.
+        """Return a structured array (N,) with PCL's layout, 32 bytes for each point.
 
-        The fields are x y z intensity ring time, and the itemsize is 32. Missing columns are 0. If
-        the cloud has columns in `extra`, they begin at byte 32, each aligned to its size, and the
-        itemsize is a multiple of 16.
+        The fields are x y z intensity ring time. Missing columns are 0. Columns in `extra` begin at
+        byte 32, each aligned to its size; the size of a point is then a multiple of 16.
         """
         names = [name for name in STRUCTURED.names or () if self.has_column(name)]
         self.load(*names, *self.extra)
@@ -298,9 +281,9 @@ class PointCloud:
         return structured
 
     def to_arrow(self, facts: Mapping[str, str] | None = None) -> Any:
-        """Return a `pyarrow.Table` of `columns`.
+        """Return a `pyarrow.Table` of `columns`, without copying them, except bools.
 
-        Columns are not copied, except bools. The metadata of each field has its unit.
+        The metadata of each field has its unit.
 
         Args:
             facts: further metadata of the schema. The schema always contains `units` (as JSON),
@@ -411,9 +394,7 @@ class LazyCloud(PointCloud):
     """A cloud with columns that are computed when they are first read.
 
     Attributes:
-        lazy: the columns, to which the cloud and `extra` refer. `extra` does not refer to the
-            cloud, because a reference cycle would keep the columns in memory until the next garbage
-            collection.
+        lazy: the columns of the cloud, and those in `extra`.
     """
 
     lazy: LazyColumns

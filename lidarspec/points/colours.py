@@ -1,12 +1,9 @@
 """The colours of values, the same in every picture.
 
-Low values are blue, medium values green and high values yellow.
-
-The scale is a helix in the colour space OKLab, in which equal distances look equal. The lightness
-increases along the whole scale, so that readers who confuse red and green, or blue and yellow, can
-still see the order. Each theme uses its own range of lightness, so that every colour has a contrast
-of at least 3:1 with the background. The page of ``view --web`` uses the same scale, in
-``colours.ts`` of `lidarspec-web`.
+Low values are blue, medium values green and high values yellow. The scale is a helix in the colour
+space OKLab. The lightness increases along the whole scale, so that colour-blind readers can see the
+order. Every colour has a contrast of at least 3:1 with the background. The page of ``view --web``
+uses the same scale, in ``colours.ts`` of `lidarspec-web`.
 
 Source: Ottosson, A perceptual color space for image processing (2020), for the matrices.
 """
@@ -36,13 +33,7 @@ _LINEAR = (
 
 @dataclass(frozen=True)
 class Scale:
-    """A colour scale in OKLab.
-
-    Attributes:
-        lightness: the first and the last lightness, from 0 to 1.
-        hue: the first and the last hue, degrees.
-        chroma: the chroma of all colours.
-    """
+    """A colour scale in OKLab."""
 
     lightness: tuple[float, float]
     hue: tuple[float, float]

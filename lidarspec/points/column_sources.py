@@ -1,10 +1,7 @@
 """Sources of the columns of consecutive points.
 
-A cloud or a scan reads its columns from a `ColumnSource` when they are first used. The method
-`columns` of a source computes columns for a slice of its points. `batch_columns.BatchColumns` is a
-source for the points of a batch of packets, and `cloud.CloudColumns` for the points of a cloud with
-known columns. `JoinedColumns` is a concatenation of slices of other sources. Scans are joined from
-slices of batches in this way, without computing any column.
+A cloud or a scan reads its columns from a `ColumnSource` when they are first used. `JoinedColumns`
+joins slices of sources without computing any column.
 """
 
 from __future__ import annotations
@@ -24,8 +21,8 @@ class ColumnSource:
     Attributes:
         size: the number of points.
         base: the time that the column "time" counts from, int64 ns.
-        grid: how all points together are organised; see `Grid`.
-        grids: how the points of each packet are organised, if packets have different shapes.
+        grid: the organisation of all points together.
+        grids: the organisation of the points of each packet, if packets have different shapes.
         nominal: whether a default calibration is used instead of the sensor's own.
         extra: the types and units of the columns in `PointCloud.extra`, by name.
         is_level: whether all points are in the horizontal plane through the sensor.
@@ -42,9 +39,8 @@ class ColumnSource:
     def columns(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
         """Return columns of the points from `start` to `stop`, (stop - start,) each.
 
-        The result has no entry for a column that the sensor does not have. It may have further
-        columns that were computed together with the requested ones. It may lack "valid", which can
-        be computed from x, and it lacks "z" if `is_level`.
+        The result may have further columns. It has no entry for columns that the sensor does not
+        have, and it may lack "valid" and "z", which follow from x.
 
         Args:
             names: the names of columns of `PointCloud`, or of columns in `extra`.

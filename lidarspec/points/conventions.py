@@ -1,10 +1,6 @@
-"""Conventions of the columns of points, independent of the back end.
+"""Conventions for points: axes, ranges, coordinates, types and grids.
 
-The module defines axes (REP-103), ranges (REP-117), coordinates, types and the organisation of
-points in columns and rows.
-
-The reference evaluator calls the formulas with arrays, and plans call them with traced columns, so
-that each formula is written once.
+The formulas accept arrays as well as traced columns, so that each formula is written once.
 """
 
 from __future__ import annotations
@@ -52,11 +48,9 @@ _MAX_SUBTRACTED_RAD = 1e6
 def shown_range(measured: Any, invalid: Any) -> Any:
     """Return the range of points in a cloud, metres (REP-117).
 
-    The range is inf without a return, and nan if the sensor marks the point as invalid.
-
     Args:
-        measured: the measured range, metres; 0 without a return.
-        invalid: whether the sensor marks the point as invalid.
+        measured: the measured range, metres; 0 without a return, for which the result is inf.
+        invalid: whether the sensor marks the point as invalid, for which the result is nan.
     """
     return mark_invalid(
         np.where(measured == 0, np.inf, np.where(measured < 0, np.nan, measured)), invalid
@@ -64,10 +58,8 @@ def shown_range(measured: Any, invalid: Any) -> Any:
 
 
 def returned_range(measured: Any) -> Any:
-    """Return measured ranges, metres, with nan for points without a return.
-
-    For a traced column the result is a single node, which the compilers recognize.
-    """
+    """Return measured ranges, metres, with nan for points without a return."""
+    # For a traced column the result is a single node, which the compilers recognize.
     if isinstance(measured, TracedColumn):
         return measured.apply_function(returned_range, measured)
     return np.where((measured > 0) & (measured < np.inf), measured, np.nan)
@@ -83,14 +75,7 @@ def mark_invalid(measured: Any, invalid: Any) -> Any:
 def coordinates(
     distance: Any, azimuth: Any, elevation: Any, origin: Sequence[Any]
 ) -> tuple[Any, Any, Any]:
-    """Return x, y and z of points, metres.
-
-    Args:
-        distance: the distance along the beam, metres.
-        azimuth: the azimuth of the beam, radians.
-        elevation: the elevation of the beam, radians.
-        origin: x, y and z of the start of the beam, metres.
-    """
+    """Return x, y and z of points, metres."""
     level: Any = np.cos(elevation)
     sides = [np.cos(azimuth), np.sin(azimuth)]
     if _is_row_lookup(azimuth) or _is_row_lookup(elevation):
@@ -108,11 +93,8 @@ def coordinates(
 def place_points(coordinates: Sequence[Any], invalid: Any) -> list[Any]:
     """Return the x, y and z of a `Cartesian` result, metres, nan for invalid points.
 
-    A point is invalid if it is at the origin (no return), if a coordinate is not finite, or if the
-    sensor marks it as invalid.
-
     Args:
-        coordinates: x, y and z of the result.
+        coordinates: x, y and z of the result; 0, 0, 0 without a return.
         invalid: whether the sensor marks the point as invalid.
     """
     away = sum(abs(place) for place in coordinates if not is_zero(place))
@@ -135,10 +117,8 @@ def _multiply(first: Any, second: Any) -> Any:
 
 
 def _is_row_lookup(value: Any) -> bool:
-    """Return whether a traced value is a lookup of rows in a table.
-
-    Computations with such a value are done once, for the whole table.
-    """
+    """Return whether a traced value is a lookup of rows in a table."""
+    # Computations with such a value are done once, for the whole table.
     return isinstance(value, TracedColumn) and value.node.kind == "rows"
 
 
@@ -153,7 +133,7 @@ def seconds_since(time_ns: NDArray[np.int64], base: int) -> NDArray[np.float64]:
 
 
 class Grid(NamedTuple):
-    """How the points of a packet are organised in columns and rows.
+    """The organisation of points in columns and rows.
 
     Attributes:
         rows: the number of directions in a column; 0 if the points are not organised.
@@ -170,12 +150,11 @@ class Grid(NamedTuple):
 
 
 def make_grid(shape: Sequence[int], axes: Sequence[str | None]) -> Grid:
-    """Return how points of a given shape are organised.
+    """Return the organisation of points of a given shape.
 
     Args:
         shape: the lengths of the axes of the points.
-        axes: the names of the axes. The axis that `stack` adds for returns has a name that starts
-            with "<".
+        axes: the names of the axes. The name of an axis for returns starts with "<".
     """
     is_stacked = bool(axes) and (axes[-1] or "").startswith("<")
     *lengths, returns = shape if is_stacked else (*shape, 1)
@@ -187,7 +166,7 @@ def make_grid(shape: Sequence[int], axes: Sequence[str | None]) -> Grid:
 
 
 class Grids(NamedTuple):
-    """How the points of packets with several shapes are organised, in stream order.
+    """The organisation of the points of packets with several shapes, in stream order.
 
     Attributes:
         ends: (n,) the index after the last point of each packet.
@@ -200,11 +179,7 @@ class Grids(NamedTuple):
     grids: Sequence[Grid]
 
     def grid_between(self, start: int, stop: int) -> Grid:
-        """Return how the points from `start` to `stop` are organised.
-
-        The result is an empty `Grid` if the packets of the points are organised differently, or if
-        the points are not whole columns.
-        """
+        """Return the organisation of points `start` to `stop - 1`, or an empty `Grid`."""
         first = self.ends.searchsorted(start, side="right")
         last = self.ends.searchsorted(stop)
         begin = int(self.ends[first - 1]) if first else 0
@@ -217,12 +192,10 @@ class Grids(NamedTuple):
 
 
 def slice_grid(grid: Grid, first: int, number: int) -> Grid:
-    """Return how a slice of organised points is organised.
-
-    The result is an empty `Grid` if the slice contains a part of a column.
+    """Return the organisation of a slice; an empty `Grid` for parts of columns.
 
     Args:
-        grid: how all points are organised.
+        grid: the organisation of all points.
         first: the index of the first point of the slice, in the cloud or in its packet.
         number: the number of points of the slice.
     """
@@ -275,11 +248,7 @@ def convert_numbers(values: NDArray[Any], dtype: Any) -> NDArray[Any]:
 
 
 def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
-    """Return the (3, 3) matrix from REP-103 coordinates to named axes.
-
-    Args:
-        axes: the directions of x, y and z, for example ("forward", "left", "up").
-    """
+    """Return the (3, 3) matrix from REP-103 coordinates to named axes."""
     matrix = np.zeros((3, 3))
     for row, name in enumerate(axes):
         axis, is_opposite = divmod(DIRECTIONS.index(name), 2)
@@ -288,10 +257,7 @@ def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
 
 
 def find_axes(sensor: SensorDescription) -> tuple[str, str, str]:
-    """Return the directions of the x, y and z axes of a sensor's points.
-
-    The axes are the REP-103 axes, or the vendor's axes if these are configured.
-    """
+    """Return the directions of the x, y and z axes of a sensor's points."""
     if sensor.options.get("frame") == "vendor":
         wanted = sensor.vendor_axes
     else:
@@ -301,10 +267,7 @@ def find_axes(sensor: SensorDescription) -> tuple[str, str, str]:
 
 @lru_cache(maxsize=256)
 def vendor_turn(sensor: SensorDescription) -> NDArray[np.float64] | None:
-    """Return the (3, 3) matrix from REP-103 to the configured axes.
-
-    Returns None if the configured axes are the REP-103 axes.
-    """
+    """Return the (3, 3) matrix from REP-103 to the configured axes; None if equal."""
     axes = find_axes(sensor)
     if axes == REP_103:
         return None
@@ -312,12 +275,7 @@ def vendor_turn(sensor: SensorDescription) -> NDArray[np.float64] | None:
 
 
 def turn_azimuth(angles: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert azimuths to rotated axes, radians in [-pi, pi].
-
-    Args:
-        angles: the azimuths, radians.
-        turn: the (3, 3) rotation matrix.
-    """
+    """Convert azimuths to rotated axes, radians in [-pi, pi]."""
     direction = turn[:2, :2] @ np.stack([np.cos(angles), np.sin(angles)])
     return np.asarray(np.arctan2(direction[1], direction[0]))
 

@@ -1,8 +1,7 @@
 """Evaluate the points of packets by plans, or by the reference evaluator.
 
-Plans are used if the `points` function can be traced. At first, only values that later batches
-depend on are computed, and the conditions of plans are checked. Columns are computed when they are
-first read. The points of a packet do not depend on the batch that contains it.
+Plans are used if the `points` function can be traced. Columns are computed when they are first
+read. The points of a packet do not depend on the batch that contains it.
 """
 
 from __future__ import annotations
@@ -43,17 +42,13 @@ def evaluate(
 ) -> EvaluatedPoints:
     """Return the points of a batch, evaluated in the fastest possible way.
 
-    The columns are the same as those of `evaluate_plainly`, within a few units in the last place.
-
     Args:
         carry: the state left by the previous batch.
-        final: whether no packets follow. If True, values that depend on following packets
-            (`following`) are nan, and the points of all packets are returned.
+        final: whether no packets follow. If True, the result has the points of all packets.
         epoch: the stamp of the cloud, int64 ns; by default the time of the first packet.
 
     Raises:
-        PluginError: if the plugin's function fails or returns columns of a wrong shape; the cause
-            is chained.
+        PluginError: if the plugin's function fails or returns columns of a wrong shape.
     """
     planned = _evaluate_by_plans(packets, carry, final=final, epoch=epoch)
     if planned is not None:
@@ -64,10 +59,7 @@ def evaluate(
 def _evaluate_by_plans(
     packets: PacketBatch, carry: Carry | None, *, final: bool, epoch: int | None
 ) -> EvaluatedPoints | None:
-    """Return the points of a batch, evaluated by plans.
-
-    Returns None if a layout has no plan, or if its plan is not valid for the batch.
-    """
+    """Return the points of a batch, evaluated by plans; None without a valid plan."""
     table = packets.table
     if not isinstance(table, CompiledTable) or not table.groups:
         return None
@@ -117,8 +109,7 @@ def _make_group(
 
     Args:
         whole: the values of the whole batch.
-        remembered: the values of nodes that depend on earlier packets, for the whole batch, by node
-            number.
+        remembered: the values that depend on earlier packets, for the whole batch, by node number.
     """
     is_whole = len(group.where) == len(batch) and group.is_in_order
     if is_whole:
@@ -127,11 +118,7 @@ def _make_group(
 
 
 def _is_valid(share: GroupPoints) -> bool:
-    """Return whether the plan of a group is valid for the packets of the group.
-
-    This checks the lengths of axes, the signs of factors, and the magnitude of floating-point
-    fields.
-    """
+    """Return whether the plan of a group is valid for the packets of the group."""
     values = share.plain_values
     for node, number in share.plan.tape.steps:
         if len(values.column(node).steps()) != number:
@@ -144,10 +131,7 @@ def _is_valid(share: GroupPoints) -> bool:
 
 
 def _is_moderate(share: GroupPoints, node: Node) -> bool:
-    """Return whether all numbers of a field are suitable for computation in float32.
-
-    They must be finite, and within `MODERATE_SIZES`.
-    """
+    """Return whether all numbers of a field are suitable for computation in float32."""
     leaf = share.plan.layout.leaves.get(node.path)
     if leaf is None:
         return False
@@ -159,10 +143,8 @@ def _is_moderate(share: GroupPoints, node: Node) -> bool:
 
 
 def _are_moderate(values: NDArray[Any]) -> bool:
-    """Return whether all numbers are 0 or within `MODERATE_SIZES`.
-
-    Without their sign bits, floats can be compared as integers, which is faster.
-    """
+    """Return whether all numbers are 0 or within `MODERATE_SIZES`."""
+    # Without their sign bits, floats can be compared as integers, which is faster.
     kind = np.dtype(f"u{values.dtype.itemsize}")
     least, most = (
         np.clip(MODERATE_SIZES, 0, np.finfo(values.dtype).max).astype(values.dtype).view(kind)
@@ -213,8 +195,6 @@ def evaluate_guarded(
     packets: PacketBatch, carry: Carry | None = None, *, final: bool, epoch: int
 ) -> EvaluatedPoints | None:
     """Return the points of a batch of a stream; None if the plugin fails.
-
-    The failure is counted in the `Counters` of the packets.
 
     Args:
         carry: the state left by the previous batch.

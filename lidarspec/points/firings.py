@@ -1,11 +1,8 @@
 """Group the returns of each firing, and choose one of them.
 
-Returns belong to one firing if they have the same column and ring. The points of most sensors have
-no column; their returns have the same time and ring. If several points have the same return index,
-time and ring, they belong to successive firings. The first point with each return index belongs to
-the first firing.
-
-A return of a firing may be missing, because it was not sent, or because its packet is lost.
+Returns with the same column and ring belong to one firing. Without columns, returns with the same
+time and ring belong to one firing. A return may be missing, because it was not sent, or because its
+packet is lost.
 """
 
 from __future__ import annotations
@@ -71,19 +68,18 @@ def choose_returns(
 ) -> NDArray[np.intp]:
     """Return the index of the chosen return of each firing, (firings,).
 
-    Only valid returns are chosen. A firing without a valid return keeps its return with the lowest
-    index.
+    A firing without a valid return keeps its return with the lowest index.
 
     Args:
         which: "first", "last" or "strongest". The strongest return has the highest intensity.
-        names: the names of the returns, by return index (`Sensor.returns`). If `which` is one of
-            them, the return with this name is chosen. Otherwise, the first return is the one with
-            the smallest range, and the last return the one with the largest range. Without names,
-            returns are ordered by their index.
+        names: the names of the returns, by return index (`Sensor.returns`); a return with the name
+            `which` is chosen.
 
     Raises:
         UsageError: for "strongest" if there is neither an intensity nor a return of this name.
     """
+    # If returns have other names, the first return is the nearest one. Without names, the order is
+    # that of the return indices.
     firings = group_firings(cloud)
     is_missing = firings == MISSING
     if which == "strongest" and cloud.intensity is not None:
@@ -107,10 +103,7 @@ def choose_returns(
 
 
 def take_returns(cloud: PointCloud, indices: NDArray[np.intp]) -> PointCloud:
-    """Return the points at `indices`, which select one return of each firing.
-
-    The result is organised if the cloud is, and if the rings still repeat in every column.
-    """
+    """Return the points at `indices`, which select one return of each firing."""
     picked = cloud[indices]
     if cloud.shape is None or picked.ring is None:
         return picked

@@ -1,8 +1,4 @@
-"""The packets of one layout in a batch, with their plan and their values.
-
-A batch has a `GroupPoints` for each layout. The `PlainValues` of a group evaluates the nodes of the
-plan by the reference evaluator, each node once.
-"""
+"""The packets of one layout in a batch, with their plan and their values."""
 
 from __future__ import annotations
 
@@ -24,10 +20,7 @@ MAX_EXACT_BYTES = 4
 
 
 class PlainValues:
-    """The values of nodes for one batch, computed once by the reference evaluator.
-
-    `column` returns values with the names of their axes; `array` returns plain arrays.
-    """
+    """The values of nodes for one batch, computed once by the reference evaluator."""
 
     def __init__(self, batch: Batch) -> None:
         self._fields = Fields(batch)
@@ -50,11 +43,7 @@ class PlainValues:
         return self._arrays[node]  # type: ignore[no-any-return]
 
     def read_raw(self, node: Node, first: int, stop: int) -> NDArray[Any] | None:
-        """Return the raw integers of a field, (n, ...).
-
-        The integers are those of packets `first` to `stop - 1`. Returns None if the node is not an
-        integer field, if the field has a scale, or if a packet lacks the field.
-        """
+        """Return the raw integers of a field, (n, ...), or None if it has none."""
         if node.kind == "field":
             info = self._table.schema.fields.get(node.path)
         else:
@@ -115,11 +104,7 @@ class GroupPoints:
         return len(self.group.where)
 
     def fill(self, maker: ColumnMaker, first: int, stop: int | None) -> dict[str, NDArray[Any]]:
-        """Return columns of packets `first` to `stop - 1`; a `stop` of None means all.
-
-        Args:
-            maker: the object that computes the columns.
-        """
+        """Return columns of packets `first` to `stop - 1`; a `stop` of None means all."""
         rows = self.group.rows[first:stop]
         columns = maker.columns(len(rows))
 
@@ -141,8 +126,7 @@ class GroupPoints:
             stop: the index after the last packet; None for the end of the group.
 
         Returns:
-            An array of shape (stop - first, *plan.shape). It is float64, except for a column of
-            `extra` with the raw integers of a field, which has the type of the field.
+            (stop - first, *plan.shape) float64; the type of the field for raw integers in `extra`.
         """
         stop = len(self) if stop is None else stop
         part = self.plan.parts[name]
@@ -169,8 +153,8 @@ class GroupPoints:
         """Return a group for some packets of a batch.
 
         Args:
-            remembered: the values of nodes that depend on earlier packets, for the whole batch, by
-                node number.
+            remembered: the values that depend on earlier packets, for the whole batch, by node
+                number.
         """
         own = batch.of(group)
         share = cls(plan, group, PlainValues(own), own)
@@ -186,8 +170,6 @@ class GroupPoints:
 
     def take(self, which: NDArray[np.intp]) -> GroupPoints:
         """Return a group with some of the packets of this group.
-
-        The values of nodes that depend on earlier packets are not computed again.
 
         Args:
             which: the indices of the packets.

@@ -1,12 +1,7 @@
 """Tabulate expressions of one field for all values of its bytes.
 
-If a field occupies at most two bytes (its window), an expression of this field alone has at most
-65,536 values. A table has the value of the expression for every value of the window. A lookup in
-this table replaces all computations with byte order, bits, scale, sines and cosines. Both compilers
-of points use such tables, and the plan uses them to find out whether an expression can be infinite
-or nan.
-
-If frames are encoded on the wire (`Frame.wire`), windows refer to the decoded bytes.
+An expression of a field of one or two bytes has at most 65,536 values. A lookup in a table of these
+values replaces all computations with byte order, bits, scale, sines and cosines.
 """
 
 from __future__ import annotations
@@ -44,11 +39,8 @@ _DIVISIONS = {np.true_divide, np.mod}
 class FieldWindow:
     """The one or two bytes that contain a field, read as a little-endian integer.
 
-    This integer is the index in a lookup table.
-
     Attributes:
-        offset: the offset of the window in the frame. For a field in arrays, it is the offset in
-            the first element of each array.
+        offset: the offset of the bytes in the frame, or in its first array elements.
         size: the number of bytes, 1 or 2.
     """
 
@@ -62,10 +54,7 @@ class FieldWindow:
 
 
 def find_window(leaf: Leaf) -> FieldWindow | None:
-    """Return the one or two bytes that contain a field.
-
-    Returns None if the field is in more bytes, or if it is an array inside a bit block.
-    """
+    """Return the one or two bytes that contain a field; None if there are more."""
     if leaf.wire is not None:
         if leaf.wire.itemsize <= 2 and leaf.wire.kind in "iu":
             return FieldWindow(leaf.offset, leaf.wire.itemsize)
@@ -79,10 +68,7 @@ def find_window(leaf: Leaf) -> FieldWindow | None:
 
 
 def raw_values(leaf: Leaf, field_window: FieldWindow) -> NDArray[Any]:
-    """Return the raw value of a field for every value of the bytes that contain it.
-
-    The shape is (256,) or (65536,).
-    """
+    """Return the raw value of a field for all values of its bytes, (256,) or (65536,)."""
     codes = np.arange(1 << (8 * field_window.size)).astype(field_window.dtype)
     frames = np.zeros((len(codes), leaf.size), np.uint8)
     start = field_window.offset - leaf.offset
@@ -107,11 +93,7 @@ def tabulate_values(node: Node, leaf: Leaf) -> NDArray[Any] | None:
 
 
 def list_possible_values(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
-    """Return all values that an expression can have, (256,) or (65536,).
-
-    Returns None if the expression depends on several fields, or on a field that is not in one or
-    two bytes.
-    """
+    """Return all possible values of an expression, (256,) or (65536,), or None."""
     source = get_only_field(node)
     if source is not None:
         leaf = leaves.get(source.path)
@@ -123,9 +105,7 @@ def list_possible_values(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any]
 
 
 def is_always_finite(value: Any, leaves: Any) -> bool:
-    """Return whether an expression is finite for all finite values of its fields.
-
-    Returns False if this is not certain.
+    """Return whether an expression is certainly finite if its fields are finite.
 
     Args:
         value: a node, or an array that does not depend on data.

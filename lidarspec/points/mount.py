@@ -15,15 +15,15 @@ from lidarspec.points.conventions import narrow_angle
 class Mount:
     """Position and orientation of a sensor on its carrier.
 
-    The axes of both point forward, left and up (REP-103). An inverted sensor is first turned upside
-    down. The sensor is then rotated by roll, pitch and yaw about the fixed axes of the carrier.
+    The axes of both point forward, left and up (REP-103). The sensor is rotated by roll, pitch and
+    yaw about the fixed axes of the carrier.
 
     Attributes:
         x, y, z: the position of the sensor's origin, metres forward, left and up.
         roll_deg, pitch_deg, yaw_deg: the angles about x, y and z, degrees, right-handed. With a yaw
             of 90 the sensor faces to the left.
-        inverted: whether the sensor is mounted upside down, which is half a turn about its forward
-            axis.
+        inverted: whether the sensor is turned upside down about its forward axis before the
+            rotation.
     """
 
     x: float = 0.0
@@ -54,12 +54,8 @@ class Mount:
     def apply(self, cloud: PointCloud) -> PointCloud:
         """Return a cloud in the axes of the carrier.
 
-        Args:
-            cloud: the cloud in the axes of the sensor.
-
-        Returns:
-            The cloud with x, y and z relative to the carrier's origin, and with azimuth and
-            elevation in the carrier's axes. `range` is still the distance from the sensor.
+        Coordinates and angles are relative to the carrier. `range` is still the distance from the
+        sensor.
         """
         turn = self.rotation
         azimuth = cloud.azimuth.astype(np.float64)

@@ -1,25 +1,12 @@
 """Plan the columns of a sensor's points as expressions of its fields.
 
 The `points` function is traced once for each layout. `Plan` converts its result to expressions of
-the columns, by the formulas of `points.conventions` that the reference evaluator uses as well, and
-lists the conditions that each batch has to meet. A back end (`points.numpy_plan` or
-`points.numba_kernels`) compiles the plan to a `ColumnMaker`, which computes the columns. A layout
-keeps its plans.
+the columns, by the formulas of `points.conventions`. A back end compiles the plan to a
+`ColumnMaker`, which computes the columns.
 
-The coordinates of a `Cartesian` result are three expressions and a mask
-(`conventions.place_points`); range and angles are computed from the coordinates. These columns are
-exact, which means that they are computed in float64 in the order in which they are written, for any
-values of floating-point fields.
-
-The columns of a `Polar` result are computed in another order and partly in float32. The plan is
-valid only if the floating-point fields of a batch are within `MODERATE_SIZES`.
-
-A column in `extra` is compiled if it is float32, or if it contains the raw integers of a field.
-Compiled float32 columns are exact as well. The reference evaluator computes all other columns in
-`extra`, and converts them to their type.
-
-An expression is called full if each point has its own value. All other expressions have one value
-for each packet or block.
+The columns of a `Cartesian` result are exact: they are computed in float64 in the order in which
+they are written. The columns of a `Polar` result may be computed in another order and partly in
+float32, so that the floating-point fields of a batch have to be within `MODERATE_SIZES`.
 """
 
 from __future__ import annotations
@@ -82,9 +69,8 @@ class ColumnMaker(Protocol):
 
         Args:
             rows: the frames, (n, size), evenly spaced in memory.
-            values: a function that computes the value of a node with the reference evaluator, (n or
-                1, ...).
-            columns: the arrays to fill, by name. The method `columns` makes them.
+            values: a function that returns the value of a node, (n or 1, ...).
+            columns: the arrays to fill, by name.
         """
 
 
@@ -95,14 +81,12 @@ class Plan:
         function: the `points` function.
         layout: the layout of the frames.
         tape: the traced operations of `points`.
-        parts: the parts of the result of `points`, by name, as nodes, or as arrays if they do not
-            depend on data.
+        parts: the parts of the result of `points`, by name, as nodes or constant arrays.
         shape: the shape of the points of a packet, one length for each axis in `axes`.
         expressions: the columns that back ends compute, by name, as nodes or arrays.
         extra: the types of the columns in `extra`, by name.
         sent: the fields with the raw integers of columns in `extra`, by the name of the column.
-        exact: whether coordinates and range are computed in float64 in the order in which they are
-            written. All other columns are always computed in this way.
+        exact: whether coordinates and range are computed in float64 in the written order.
         positive: nodes whose values have to be positive numbers for the plan to be valid.
         nominal: whether a default calibration is used instead of the sensor's own.
         varying: the arrays whose lengths differ from frame to frame.
@@ -111,8 +95,7 @@ class Plan:
         kernels: the compiled kernels of `numba_kernels`, by the names of their columns.
 
     Raises:
-        UntraceableError: if only the reference evaluator can compute the points. The text is the
-            reason.
+        UntraceableError: if only the reference evaluator can compute the points.
     """
 
     def __init__(self, function: PointsFunction, sample: Batch, layout: Layout) -> None:
@@ -201,9 +184,7 @@ class Plan:
         return self.exact or name == "intensity" or name in self.extra
 
     def _find_sent_field(self, part: Any, dtype: np.dtype[Any]) -> Leaf | None:
-        """Return the field whose raw integers are the values of a column in `extra`.
-
-        Returns None if the column has to be computed.
+        """Return the field whose raw integers are a column in `extra`, or None.
 
         Args:
             part: the expression of the column.
@@ -243,11 +224,9 @@ class Plan:
 
     @cached_property
     def eager_nodes(self) -> list[Node]:
-        """The nodes to compute for every batch, in order.
-
-        They are nodes that keep values between batches, nodes that are checked for each batch, and
-        the inputs of these nodes.
-        """
+        """The nodes to compute for every batch, in order."""
+        # They keep values between batches or are checked for each batch, or are inputs of such
+        # nodes.
         wanted = [node for node in self.tape.nodes if node.kind in STATEFUL_KINDS]
         wanted += [node for node, _ in self.tape.steps] + self.positive
         return sorted(graph.traverse(*wanted), key=lambda node: node.number)
@@ -284,11 +263,8 @@ class Plan:
         return dict(zip("xyz", place_points(places, parts["invalid"]), strict=True)) | columns
 
     def _mark_distance(self, measured: TracedColumn) -> Any:
-        """Return the distance of points, nan without a return.
-
-        If the distance is the product of a field and a factor for each packet or block, the factor
-        has to be positive. It is added to `positive`.
-        """
+        """Return the distance of points, nan without a return."""
+        # The field shows whether there is a return only if the factor is positive.
         node = measured.node
         if get_only_field(node) is None and node.kind == "call" and node.function is np.multiply:
             for full, low in (node.args, node.args[::-1]):
@@ -307,8 +283,6 @@ class Plan:
     def has_finite_directions(self, values: Callable[[Node], NDArray[Any]]) -> bool:
         """Return whether all azimuths and elevations of a batch are finite.
 
-        If so, the coordinates of a point are either all nan or all finite.
-
         Args:
             values: a function that returns the value of a node for the batch.
         """
@@ -325,10 +299,7 @@ class Plan:
 
     @cached_property
     def _may_have_finite_directions(self) -> bool:
-        """Whether azimuth and elevation are finite, as far as is known without a batch.
-
-        `has_finite_directions` checks the values of a batch.
-        """
+        """Whether azimuth and elevation are finite, as far as is known without a batch."""
         fixed = all(
             isinstance(part, Node) or np.isfinite(part).all() for part in self._directions_given
         )
@@ -371,10 +342,7 @@ _TABLES: WeakKeyDictionary[PointsFunction, dict[Any, NDArray[Any]]] = WeakKeyDic
 
 
 def plan_for(function: PointsFunction, batch: Batch, group: LayoutRows) -> Plan | UntraceableError:
-    """Return the plan for a group of frames, or the reason why it has none.
-
-    The layout caches the result.
-    """
+    """Return the plan for a group of frames, or the reason why it has none."""
     notes = group.layout.notes
     if function not in notes:
         try:

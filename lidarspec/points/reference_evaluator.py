@@ -2,8 +2,6 @@
 
 The sensor's `points` function is called once per batch with columns as NumPy arrays, and its result
 is flattened. This evaluator is used if `points` cannot be traced, and as the reference in tests.
-Plans (`points.plan`) use the same names for the parts of a result, and the same formulas
-(`points.conventions`).
 """
 
 from __future__ import annotations
@@ -65,8 +63,7 @@ class EvaluatedPoints:
 
     Attributes:
         source: the columns of the points, flat, in stream order.
-        ready: the number of packets with points; all later packets of the batch wait for the next
-            batch.
+        ready: the number of packets with points; all later packets wait for the next batch.
         counts: (ready, ...) 1 for each point and 0 for padding, with an axis for each array level.
         axes: the names of the axes of `counts` after the first.
         batch: all packets of the batch.
@@ -105,13 +102,11 @@ def evaluate_plainly(
 
     Args:
         carry: the state left by the previous batch.
-        final: whether no packets follow. If True, values that depend on following packets
-            (`following`) are nan, and the points of all packets are returned.
+        final: whether no packets follow. If True, the result has the points of all packets.
         epoch: the stamp of the cloud, int64 ns; by default the time of the first packet.
 
     Raises:
-        PluginError: if the plugin's function fails or returns columns of a wrong shape; the cause
-            is chained.
+        PluginError: if the plugin's function fails or returns columns of a wrong shape.
     """
     batch = packets.batch(carry)
     function = packets.sensor.points_of(packets.frame)
@@ -137,10 +132,7 @@ def find_stamp(packets: PacketBatch, epoch: int | None) -> int:
 
 
 def list_parts(result: Points) -> dict[str, Any]:
-    """Return the parts of a `points` result by name, without missing parts.
-
-    The origin is split into ox, oy and oz.
-    """
+    """Return the parts of a `points` result by name, without missing parts."""
     parts = {
         f.name: getattr(result, f.name)
         for f in fields(result)
@@ -153,11 +145,7 @@ def list_parts(result: Points) -> dict[str, Any]:
 
 
 def list_extra_types(result: Points, parts: Mapping[str, Any]) -> dict[str, ExtraType]:
-    """Return the types of the columns in `extra`, by name.
-
-    Args:
-        parts: the parts of the result.
-    """
+    """Return the types of the columns in `extra`, by name."""
     return {name: ExtraType.of(extra, parts[name]) for name, extra in result.extra.items()}
 
 
@@ -194,7 +182,7 @@ def _make_points(
 
 
 def _find_grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conventions.Grids:
-    """Return how the points of each packet are organised.
+    """Return the organisation of the points of each packet.
 
     Args:
         inside: whether an element of the arrays is a point and not padding, (n, ...).
@@ -217,10 +205,7 @@ def _find_grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conv
 def flatten_valid(
     array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int
 ) -> NDArray[Any]:
-    """Broadcast an array to a shape, and return the values of all points, (N,).
-
-    Only the first `ready` packets are included. Padding is left out.
-    """
+    """Broadcast an array to a shape, and return the values of all points, (N,)."""
     full = np.broadcast_to(array, shape)[:ready]
     if mask is None:
         return full.reshape(-1)
@@ -237,8 +222,7 @@ def make_cloud(
 
     Args:
         flat: the parts of `Polar` (with ox, oy, oz) or `Cartesian`, (N,) each.
-        turn: the (3, 3) matrix from REP-103 to the configured axes; None if the configured axes are
-            the REP-103 axes.
+        turn: the (3, 3) matrix from REP-103 to the configured axes; None if they are equal.
         kinds: the types of the columns in `extra`, by name.
         facts: `stamp_ns`, `shape` and `nominal` of the cloud.
     """

@@ -47,16 +47,14 @@ def arrow_schema(
 ) -> Any:
     """Return the `pyarrow.Schema` of some columns of points.
 
-    Float columns are not nullable, because this is faster to write. A missing value is nan.
-
     Args:
-        units: the unit of each column by name, without columns of plain numbers. Each field has its
-            unit in its metadata, and the schema has all units as JSON.
+        units: the unit of each column by name, without columns of plain numbers.
         facts: further metadata of the schema.
 
     Raises:
         UsageError: if pyarrow is not installed.
     """
+    # Float columns are not nullable, because this is faster to write. A missing value is nan.
     arrow = import_library("pyarrow", "arrow")
     fields = [
         arrow.field(

@@ -1,8 +1,7 @@
-"""Compute points and checksums by compiled code: an optional back end, which needs Numba.
+"""Compute points and checksums by compiled code: a back end that needs Numba.
 
 `compile` returns an object that computes columns of a `points.plan.Plan`. `compile_sums` returns
-the function that computes the checksums for a decoder. Only ``backend="jit"`` requires this
-package. Numba is imported with the first kernel that runs. Modules in reading order:
+the function that computes the checksums for a decoder. Modules in reading order:
 
 * `arithmetic`: the functions that kernels call. Importing this module imports Numba.
 * `writer`: writes the source of fields, tables and indices.

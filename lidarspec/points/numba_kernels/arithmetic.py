@@ -1,10 +1,6 @@
 """Functions that generated kernels call.
 
-The functions read bytes without bounds checks, compute sine and cosine in float32, and return the
-same results as NumPy for nan and infinity.
-
-Importing this module imports Numba; importing any other module does not. Only generated kernels
-import this module.
+Importing this module imports Numba. Only generated kernels import it.
 """
 
 from __future__ import annotations
@@ -114,10 +110,8 @@ def four_at(context, array, index):
 
 @intrinsic
 def assume_no_alias(context):
-    """Declare that the array arguments of the kernel do not overlap.
-
-    The compiler can then compute several points at a time.
-    """
+    """Declare that the array arguments of the kernel do not overlap."""
+    # The compiler can then compute several points at a time.
 
     def make(target, builder, signature, args):
         for argument in builder.function.args[2:]:
@@ -139,10 +133,7 @@ def multiply_add(context, factor, other, added):
 
 
 def _float_at(bits, kind):
-    """Return two intrinsics that load a float from bytes and convert it to float64.
-
-    The first one loads little-endian floats, the second one big-endian floats. Their index is the
-    offset of the first byte.
+    """Return functions that read a little-endian and a big-endian float as float64.
 
     Args:
         bits: the size of the float.
@@ -280,10 +271,7 @@ def look_up(table, index):
 
 @njit(forceinline=True)
 def row_at(index, rows):
-    """Return `index`, or the index of the last row if `index` is out of range.
-
-    The last row contains nan.
-    """
+    """Return `index`, or the index of the last row, which has nan, if out of range."""
     if 0 <= index < rows - 1:
         return np.int64(index)
     return rows - 1

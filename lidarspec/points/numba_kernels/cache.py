@@ -1,11 +1,8 @@
 """Store compiled kernels on disk between runs.
 
-The compiled code is executed, so the files are in a folder that only the user can access.
-
-The file of a kernel is a keyed digest (HMAC), followed by the pickle of the compiled code. The
-pickle is loaded only if the digest is valid. The key is in a file that only the user can read, and
-the names of the kernel files depend on the key. A file from another user, or a file that was not
-written completely, is therefore never executed. If a check fails, the kernel is compiled again.
+The compiled code is executed, so the files are in a folder that only the user can access. Each file
+begins with a keyed digest (HMAC) of the code. A file with a wrong digest is not loaded, and the
+kernel is compiled again.
 """
 
 from __future__ import annotations
@@ -52,10 +49,7 @@ class StoredKernel:
         self._name = name
 
     def load_overload(self, signature: object, target: Any) -> Any:
-        """Return the code that an earlier run compiled.
-
-        Returns None if it is not stored, or if it is not authentic.
-        """
+        """Return the code that an earlier run compiled; None without authentic code."""
         from numba.core.compiler import CompileResult
 
         with contextlib.suppress(Exception):  # if this fails, Numba compiles the kernel
@@ -131,10 +125,7 @@ def _check_private(folder: Path) -> Path:
 
 
 def _read_key(folder: Path) -> bytes | None:
-    """Return the key of a folder; None if it is missing or invalid.
-
-    The key is also invalid if other users can access it.
-    """
+    """Return the key of a folder; None if it is missing, invalid or not private."""
     with contextlib.suppress(OSError):
         key = _read(folder / "key")
         if len(key) == DIGEST_BYTES:
@@ -174,10 +165,7 @@ def _read(path: Path) -> bytes:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a file that only the user can read.
-
-    The file appears at its path when it is complete.
-    """
+    """Write a file that only the user can read."""
     number, unfinished = tempfile.mkstemp(dir=path.parent)
     try:
         with open(number, "wb") as file:
@@ -190,5 +178,5 @@ def _write(path: Path, data: bytes) -> None:
 
 @functools.cache
 def _warn(text: str) -> None:
-    """Issue a warning. Each text is issued only once in a run of the program."""
+    """Issue a warning once in a run of the program."""
     warnings.warn(text, stacklevel=2)

@@ -1,14 +1,11 @@
 """Compute checksums of many frames by compiled code.
 
-A CRC is linear with respect to XOR, and so is every XOR of bytes or words. The checksum of a frame
-is therefore the checksum of a frame of zeros, XORed with the share of each byte. The share of a
-byte is the change of the checksum that this byte alone causes. Each offset has a table of 256
-shares, which is made by running the algorithm. If shares are equal to the bytes, words of eight
-bytes are XORed instead.
+A checksum that is linear with respect to XOR, such as a CRC, is the checksum of a frame of zeros,
+XORed with one value for each byte. This value, the share of the byte, is looked up in a table of
+256 values for each offset.
 
-CRCs of many bytes, and CRCs of more than 16 bits, are computed eight bytes at a time by eight
-tables of 256 entries ("slicing by eight"). Four rows are computed side by side, because each step
-of a row depends on its previous step.
+CRCs of many bytes, and CRCs of more than 16 bits, are computed eight bytes at a time ("slicing by
+eight").
 """
 
 from __future__ import annotations
@@ -134,20 +131,16 @@ def _compute_along_rows(
 class _ByteShares:
     """Tables from which the checksum of a frame is computed byte by byte.
 
-    The checksum is the XOR of `start` and of a share for each byte, which depends on the position
-    and the value of the byte.
-
     Attributes:
         seen: the number of frames so far.
         is_suited: whether the checksum can be computed from shares.
         start: the checksum of a frame of zeros.
         words: the offsets at which words of eight bytes are loaded.
-        tables: the share of each byte of these words, by its value. It is 0 for bytes that the
-            checksum does not cover, and for bytes that an earlier word contains.
+        tables: the share of each byte of these words, by its value; 0 for bytes that do not count.
         is_plain: whether each share is the byte itself, in the low or the high byte of the
             checksum.
-        lows: if `is_plain`, for each word, a mask of the bytes whose share is in the low byte of
-            the checksum.
+        lows: if `is_plain`, for each word, a mask of the bytes with a share in the low byte of the
+            checksum.
         highs: the same for the high byte of the checksum.
     """
 
@@ -210,10 +203,7 @@ _SHARES_BY_SEAL: WeakKeyDictionary[Seal, _ByteShares] = WeakKeyDictionary()
 
 
 def checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64] | None:
-    """Return the checksums of frames, (n,).
-
-    Returns None if NumPy is faster, or if only NumPy can compute the checksums.
-    """
+    """Return the checksums of frames, (n,); None if NumPy should compute them."""
     shares = _SHARES_BY_SEAL.get(seal)
     if shares is None and not seal.spans:
         return None  # over no bytes there is nothing to compute

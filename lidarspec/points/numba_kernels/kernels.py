@@ -1,7 +1,6 @@
 """Compile or load kernels, and call them in one or more threads.
 
-Numba is imported when the first kernel is needed. The name of a kernel is a hash of everything that
-its code depends on, except for the processor.
+Numba is imported when the first kernel is needed.
 """
 
 from __future__ import annotations
@@ -96,8 +95,7 @@ class Kernel(ColumnMaker):
 
         Args:
             count: the number of frames.
-            run: a function with two arguments, the first frame and the number of frames. It calls
-                the kernel for these frames.
+            run: a function that calls the kernel, given the first frame and the number of frames.
         """
         number = min(count_threads(), max(count * self._width // MIN_THREAD_POINTS, 1), count)
         if number < 2:
@@ -115,10 +113,8 @@ class Kernel(ColumnMaker):
 
 
 def _flatten(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.float64], int]:
-    """Return a flattened array (n or 1, *shape), and the number of its values per packet.
-
-    This number is 0 if all packets share the values.
-    """
+    """Return a flattened array, and the number of values of each packet."""
+    # The number is 0 if all packets share the values.
     full = (len(array), *shape)
     if array.shape != full:
         array = np.broadcast_to(array, full)
@@ -128,11 +124,9 @@ def _flatten(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.fl
 
 
 def get_kernel(plan: Plan, names: tuple[str, ...]) -> Kernel:
-    """Return the kernel that computes columns of a plan; the plan caches it.
-
-    The first layout of a `points` function has its own kernel. All other layouts share kernels that
-    accept arrays of any length.
-    """
+    """Return the kernel that computes columns of a plan; the plan caches it."""
+    # The first layout of a `points` function has its own kernel. All other layouts share kernels
+    # that accept arrays of any length.
     kernel = plan.kernels.get(names)
     if not isinstance(kernel, Kernel):
         is_own = (
@@ -181,10 +175,8 @@ def import_numba() -> None:
 
 @functools.cache
 def _make_module_name(source: str) -> str:
-    """Return a hash of everything that the compiled code depends on, as a module name.
-
-    The processor is not included, because the name of the file in the cache depends on it.
-    """
+    """Return a hash of everything that the compiled code depends on, as a module name."""
+    # The processor is not included, because the name of the file in the cache depends on it.
     from importlib.metadata import version
 
     vocabulary = Path(__file__).with_name("arithmetic.py").read_bytes()
@@ -201,13 +193,7 @@ def is_code_available(source: str) -> bool:
 
 @functools.lru_cache(maxsize=256)
 def compile_source(source: str) -> Any:
-    """Return the compiled function of a kernel.
-
-    If the compiled code cannot be stored on disk, it is compiled again in each run.
-
-    Args:
-        source: the source of the kernel.
-    """
+    """Return the compiled function of a kernel, given its source."""
     name = _make_module_name(source)
     module = types.ModuleType(name)
     module.__dict__["STORED"] = StoredKernel(name)

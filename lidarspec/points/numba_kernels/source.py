@@ -1,15 +1,11 @@
-"""Write the source of a kernel, which computes columns of a plan from the bytes of frames.
+"""Write the source of a kernel that computes points from the bytes of frames.
 
 A kernel is a nested loop over packets, blocks and points. Each value is computed in the outermost
-loop in which it is constant (`writer.KernelWriter`). `Expressions` writes traced expressions in
-float64 or float32. If a kernel cannot compute an expression, NumPy computes its values before the
-kernel is called, and they are passed as an argument.
+loop in which it is constant. If a kernel cannot compute an expression, NumPy computes it before the
+kernel is called, and passes it as an argument.
 
-If each point needs the sine or cosine of its own angle, intermediate values of the points of a few
-packets are stored in scratch arrays. A second, flat loop computes the columns from these arrays, so
-that the compiler can vectorize it (`DeferredFloat`, `KernelAssembly`). Lengths and offsets that are
-the same in all frames are numbers in the source. All others are arguments, so that one kernel can
-be used for arrays of any length.
+Sines and cosines that differ from point to point are computed in a second, flat loop, so that the
+compiler can vectorize it.
 """
 
 from __future__ import annotations
@@ -58,10 +54,7 @@ MAX_DISTANCE_BITS = 21
 
 
 class Beam(NamedTuple):
-    """A coordinate of points along beams.
-
-    The coordinate is a measured distance multiplied by an entry of a table of directions, plus an
-    entry of a table of starting points.
+    """A coordinate of points along beams: ``distance * direction + start``.
 
     Attributes:
         distance: the raw distance; nan without a return.
@@ -77,11 +70,7 @@ class Beam(NamedTuple):
 
 
 def find_beam(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
-    """Return an expression as a `Beam`.
-
-    Returns None if it is not a coordinate on a beam, or if the raw distance has too many bits for
-    float32.
-    """
+    """Return an expression as a `Beam`; None if this is not possible."""
     if node.function is not np.add or not all(isinstance(arg, Node) for arg in node.args):
         return None
     product, start = node.args
@@ -112,8 +101,6 @@ def find_beam(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
 @dataclass(frozen=True, eq=False)
 class DeferredFloat:
     """A product or sum in float32 that is computed in the flat loop over points.
-
-    At least one operand depends on the sine or cosine of an angle of each point.
 
     Attributes:
         sign: the operator, "*", "+" or "-".
@@ -193,10 +180,8 @@ class Expressions(KernelWriter):
         return self.let(1 + count_used_axes(node.shape), f"at({name}, {start.text} + {place})")
 
     def is_shared(self, node: Node) -> bool:
-        """Return whether an expression depends only on frames of other types.
-
-        NumPy computes such an expression, usually once for all packets.
-        """
+        """Return whether an expression depends only on frames of other types."""
+        # NumPy computes such an expression, usually once for all packets.
         return self.get_or_make(("shared", node), lambda: self._is_shared(node))  # type: ignore[no-any-return]
 
     def _is_shared(self, node: Node) -> bool:
@@ -282,15 +267,11 @@ class Expressions(KernelWriter):
         )
 
     def write_single(self, value: Any, *, exact: bool = False, root: bool = False) -> Any:
-        """Return the code of an expression in float32.
-
-        The result is a `KernelValue` or a `DeferredFloat`.
+        """Return the float32 code of an expression: a `KernelValue` or `DeferredFloat`.
 
         Args:
-            exact: whether the value is computed in float64 and rounded once, as in the reference
-                evaluator.
-            root: whether the expression is a whole coordinate. In this case, sums may be computed
-                in float32.
+            exact: whether to compute the value in float64 and round it once.
+            root: whether the expression is a whole coordinate, in which sums may be float32.
         """
         if not isinstance(value, Node):
             return self.write_constant(value, len(self.shape), "float32")
@@ -323,11 +304,8 @@ class Expressions(KernelWriter):
         )
 
     def _write_along_beam(self, beam: Beam) -> KernelValue | None:
-        """Return the code that computes a coordinate of points on a beam, rounded once.
-
-        The direction is split into two float32 numbers for more precision. Returns None if the
-        distance requires float64, or if NumPy computes the indices of the tables.
-        """
+        """Return the code that computes a coordinate of points on a beam, rounded once."""
+        # For more precision, the direction is split into two float32 numbers.
         sent = self._write_distance(beam.distance, raw=True)
         table = beam.direction.args[1]
         if (
@@ -347,10 +325,7 @@ class Expressions(KernelWriter):
         )
 
     def _write_distance(self, node: Node, *, raw: bool = False) -> KernelValue | None:
-        """Return the code of a distance in float32.
-
-        The distance is nan without a return, or if a condition marks the point as invalid. Returns
-        None if the expression is not a distance, or if it requires float64.
+        """Return the code of a distance in float32; nan for points without a return.
 
         Args:
             raw: True for the raw value, False for metres.
@@ -393,19 +368,13 @@ class Expressions(KernelWriter):
         return self.let(self.inner, f"np.float32(nan) if {flag.text} else {made.text}")
 
     def combine(self, sign: str, first: Any, second: Any) -> Any:
-        """Return the code of a product or sum.
-
-        The result is a `DeferredFloat` if an operand is a `DeferredFloat`.
-        """
+        """Return the code of a product or sum."""
         if isinstance(first, KernelValue) and isinstance(second, KernelValue):
             return self.let(max(first.level, second.level), f"{first.text} {sign} {second.text}")
         return DeferredFloat(sign, (first, second))
 
     def _write_field(self, node: Node, *, exact: bool) -> KernelValue | None:
-        """Return the code of an expression of one field, a linear function or a lookup.
-
-        Returns None if points share a value of the field, or if `find_window` has no result for it.
-        """
+        """Return the code of an expression of one field, a linear function or a lookup."""
         source = get_only_field(node)
         if source is not None and is_full(source, self.width):
             leaf = self.layout.leaves.get(source.path)
@@ -483,10 +452,7 @@ class Expressions(KernelWriter):
         return self.let(made.level, f"{made.text} * {factor!r}")
 
     def _write_small_angle(self, node: Node, source: Node, factor: float) -> KernelValue | None:
-        """Return the code that looks up an angle of one field; None if there is no table.
-
-        The table is float32 if this is precise enough.
-        """
+        """Return the code that looks up an angle of one field; None if there is no table."""
         values = list_possible_values(node, self.layout.leaves)
         if values is None:
             return None
@@ -525,13 +491,7 @@ _TYPES = {"float32": "SINGLES", "float64": "DOUBLES", "int64": "INTEGERS"}
 
 @dataclass(frozen=True, eq=False)
 class KernelText:
-    """The text of a kernel, its arguments and its results.
-
-    Attributes:
-        source: the source of a module with the function `kernel`.
-        wanted: the arguments of the kernel.
-        columns: the dtypes of the columns that it fills, by name.
-    """
+    """The text of a kernel, its arguments and its results."""
 
     source: str
     wanted: KernelArguments
@@ -539,10 +499,7 @@ class KernelText:
 
 
 class KernelAssembly:
-    """Writes the lines of a kernel that store columns.
-
-    The lines are in the nested loops, or in the flat loop over points.
-    """
+    """Writes the lines of a kernel that store columns."""
 
     def __init__(self, writer: Expressions) -> None:
         self.writer = writer
@@ -582,10 +539,7 @@ class KernelAssembly:
         return self._store(value, "float32")
 
     def _store(self, value: KernelValue, kind: str) -> str:
-        """Add a scratch array for a value; return the text that reads it.
-
-        The array is read in the flat loop over points.
-        """
+        """Add a scratch array for a value; return the text that reads it."""
         if value.text not in self._kept:
             name = self._kept[value.text] = f"h{len(self.scratch)}"
             self.scratch.append(f"{name} = np.empty(held, np.{kind})")
@@ -604,7 +558,7 @@ def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Kerne
     """Return the text of a kernel that computes some columns of a plan.
 
     Args:
-        varying: the arrays whose lengths the kernel accepts as arguments; empty for a kernel of one
+        varying: the arrays whose lengths are arguments of the kernel; empty for a kernel of one
             layout.
     """
     expressions = {name: plan.expressions[name] for name in names}

@@ -1,12 +1,7 @@
 """Write fields, tables, constants and indices into the source of a kernel.
 
-Each value is computed in the outermost loop in which it is constant.
-
-A `KernelValue` is the text of an expression, with the loop in which its value varies.
-`KernelWriter` keeps the lines of each loop, the arguments of the kernel, and the values that it has
-written, so that no value is computed twice. A field is an expression of its bytes
-(`write_integer`). A function of one field is looked up in a table, or computed if the table is
-linear (`LinearTable`). `TEMPLATES` has the text of NumPy's functions.
+`KernelWriter` keeps the lines of each loop, the arguments of the kernel, and the values that were
+already written. Each value is computed in the outermost loop in which it is constant.
 """
 
 from __future__ import annotations
@@ -79,14 +74,11 @@ def is_cheap(node: Node) -> bool:
 
 
 def write_integer(leaf: Leaf, byte: Any) -> str | None:
-    """Return the raw value of a field as an expression of its bytes.
+    """Return the raw value of a field as an expression of its bytes, or None.
 
     Args:
         leaf: the field.
         byte: a function that returns the expression of the byte at an offset.
-
-    Returns:
-        The text of the expression; None if there is no simple expression.
     """
     if len(leaf.shape) > len(leaf.strides) or (leaf.wire is not None and leaf.wire.kind == "f"):
         return None
@@ -115,14 +107,7 @@ def write_integer(leaf: Leaf, byte: Any) -> str | None:
 
 @dataclass(frozen=True)
 class LinearTable:
-    """A table with values that are a linear function of the raw value.
-
-    Attributes:
-        slope, start: the coefficients; the value is ``slope * raw + start``.
-        low, high: the lowest and the highest raw value of the linear part; None without a limit.
-        other: the value for all other raw values, nan or inf.
-        exact: whether the arithmetic has to be float64.
-    """
+    """A table with values that are a linear function of the raw value."""
 
     slope: float
     start: float
@@ -155,14 +140,11 @@ class LinearTable:
 
 
 def find_line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> LinearTable | None:
-    """Return the linear function with the values of a table of a field.
-
-    Returns None if the table is not linear.
+    """Return the linear function with the values of a table; None if it is not linear.
 
     Args:
         values: the values of the table.
-        exact: whether the function has to return the same float32 values as the table. If False,
-            they may differ by a unit in the last place.
+        exact: whether the function has to return exactly the float32 values of the table.
     """
     field_window = find_window(leaf)
     assert field_window is not None
@@ -204,8 +186,7 @@ def find_line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> LinearTable |
 class KernelValue:
     """The text of an expression in a kernel, and the loop in which its value varies.
 
-    The level is 0 for a constant, 1 for the loop over packets, 2 for the loop over the outermost
-    array, and so on.
+    The level is 0 for a constant, 1 for the loop over packets, and more for inner loops.
     """
 
     text: str
@@ -214,13 +195,7 @@ class KernelValue:
 
 @dataclass
 class KernelArguments:
-    """The arguments of a kernel in addition to the bytes of the frames.
-
-    Attributes:
-        arrays: arrays that do not depend on data.
-        numbers: lengths and offsets that differ from layout to layout.
-        nodes: the nodes whose values NumPy computes before the kernel is called.
-    """
+    """The arguments of a kernel in addition to the bytes of the frames."""
 
     arrays: list[NDArray[Any]] = field(default_factory=list)
     numbers: list[int] = field(default_factory=list)
@@ -231,8 +206,8 @@ def find_run(leaf: Leaf) -> tuple[str, int, int, int] | None:
     """Return the position of an unsigned field in at most four bytes.
 
     Returns:
-        The byte order, the first byte, the number of bytes and the lowest bit. None if the bits of
-        the field are not contiguous, or not in at most four bytes.
+        The byte order, the first byte, the number of bytes and the lowest bit; None for other
+            fields.
     """
     if len(leaf.shape) > len(leaf.strides):
         return None
@@ -254,8 +229,7 @@ def find_word(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
     """Return the aligned 4-byte little-endian word that contains a field.
 
     Returns:
-        The offset of the word, and the shift and mask of the field in it. None if there is no such
-        word.
+        The offset of the word, and the shift and mask of the field in it; None without such a word.
     """
     run = find_run(leaf)
     if run is None or (run[0] == ">" and run[2] > 1) or not leaf.strides or leaf.strides[-1] % 4:
@@ -285,8 +259,7 @@ class KernelWriter:
     Args:
         layout: the layout of the frames.
         shape: the shape of the points of a packet.
-        tables: the lookup tables made so far, by a key that describes their contents. New tables
-            are added.
+        tables: the lookup tables by a key that describes their contents; new tables are added.
         varying: the arrays whose lengths differ from frame to frame.
     """
 
@@ -375,11 +348,7 @@ class KernelWriter:
         return element
 
     def add_argument(self, node: Node) -> KernelValue:
-        """Add an argument with the values of a node, which NumPy computes.
-
-        Returns:
-            The text that reads the value for the current point.
-        """
+        """Add an argument with the values of a node, and return the text that reads it."""
         if node not in self.wanted.nodes:
             self.wanted.nodes.append(node)
         name = self.wanted.nodes.index(node)
@@ -426,16 +395,11 @@ class KernelWriter:
         return self._read(leaf, leaf.offset, f"float{leaf.wire.itemsize}_{order}")
 
     def write_byte(self, leaf: Leaf, offset: int) -> KernelValue:
-        """Return the text that reads a byte.
-
-        The offset counts from the start of the array element, or of the frame.
-        """
+        """Return the text that reads a byte at an offset in an array element or a frame."""
         return self._read(leaf, offset, "byte_at")
 
     def _read(self, leaf: Leaf, offset: int, reader: str) -> KernelValue:
-        """Return the text of a call that reads a value at an offset.
-
-        The offset counts from the start of the array element, or of the frame.
+        """Return the text that reads a value at an offset in an array element or a frame.
 
         Args:
             reader: the name of the function in `arithmetic`.
@@ -465,11 +429,7 @@ class KernelWriter:
         return tuple(strides)
 
     def _has_fixed_offset(self, leaf: Leaf) -> bool:
-        """Return whether a field has the same offset in all frames.
-
-        This is the case before all arrays of varying length, and in the first element of the first
-        of these arrays.
-        """
+        """Return whether a field has the same offset in all frames."""
         leaves = self.layout.leaves.values()
         found = [
             (other.offset, other.strides)
@@ -481,12 +441,10 @@ class KernelWriter:
         return leaf.offset <= first or inside
 
     def look_up(self, node: Node, source: Node, kind: Any, factor: float) -> KernelValue | None:
-        """Add a lookup that replaces an expression; return the text of the lookup.
-
-        Returns None if `find_window` has no result for the field.
+        """Return the text of a lookup that replaces an expression of one field, or None.
 
         Args:
-            node: the expression, which depends on a single field.
+            node: the expression.
             source: the field.
             kind: the dtype of the table.
             factor: a number by which the values are multiplied.
@@ -526,10 +484,8 @@ class KernelWriter:
         return f"({first} | {self.write_byte(leaf, field_window.offset + 1).text} << 8)"
 
     def look_up_trig(self, node: Node, leaf: Leaf) -> KernelValue:
-        """Return the text of a lookup of a cosine or sine.
-
-        The table has cosine and sine side by side, so that both are loaded together.
-        """
+        """Return the text of a lookup of a cosine or sine."""
+        # The table has cosine and sine side by side, so that both are loaded together.
         name = ("kernel", "both", leaf.info, leaf.size, make_key(node.args[0]))
         if name not in self._tables:
             angles = np.asarray(tabulate_values(node.args[0], leaf))

@@ -1,8 +1,7 @@
 """Compute points with NumPy alone.
 
-This back end compiles the columns of a plan to NumPy calls on small arrays that fit in the cache of
-the processor. `compile` returns an object that computes columns of a `points.plan.Plan`. Modules in
-reading order:
+`compile` returns an object that computes columns of a `points.plan.Plan` by NumPy calls on small
+arrays that fit in the cache of the processor. Modules in reading order:
 
 * `program`: runs NumPy calls on registers, chunk by chunk.
 * `compiler`: compiles expressions to the steps of a program.
@@ -37,11 +36,7 @@ def _compile(plan: Plan, names: tuple[str, ...], tables: dict[Any, NDArray[Any]]
 
 
 def describe(plan: Plan) -> list[str]:
-    """Return a description of a plan as lines of text.
-
-    The lines show the shape of the points, the values that the reference evaluator computes, and
-    the steps of the NumPy program.
-    """
+    """Return a description of a plan as lines of text."""
     names = tuple(
         name
         for name in ("x", "y", "z", "intensity")

@@ -1,14 +1,10 @@
 """Compile the expressions of a plan to the steps of a program.
 
-Each step is one NumPy call for a chunk of packets. An expression is *full* if each point has its
-own value. An expression that is not full has one value for each packet or block; the reference
-evaluator evaluates it for the whole batch, and the program broadcasts the values. An expression of
-a single field of at most two bytes becomes a lookup table (`points.lookup_tables`). All other
-expressions become the NumPy calls that the plugin wrote.
+Each step is one NumPy call for a chunk of packets. An expression of a field of at most two bytes
+becomes a lookup in a table. An expression with one value for each packet or block is evaluated once
+for the whole batch.
 
-Columns that need not be exact may be computed in float32 and in another order. Products, offsets,
-cosines and sines are float32. In a sum, the terms that are not full are added first, and the result
-is broadcast.
+A column that need not be exact may be computed in float32, and its sums in another order.
 """
 
 from __future__ import annotations
@@ -44,8 +40,6 @@ _FASTER_THAN_TABLE = {function for function in CHEAP if isinstance(function, np.
 class Compiler:
     """Compiles expressions by appending steps to a program.
 
-    Each method that compiles an expression returns the register of its result.
-
     Attributes:
         program: the program, with an output for each column that was added.
         low: the inputs of the program, which are nodes with one value for each packet or block.
@@ -66,8 +60,7 @@ class Compiler:
 
         Args:
             kind: the type of the column, "single" (float32) or "double" (float64).
-            exact: whether operations are computed in float64 in the written order. If not, products
-                may be float32, and sums may have another order.
+            exact: whether to compute in float64 in the written order.
         """
         self._is_exact = exact
         if kind == "single":
@@ -88,10 +81,8 @@ class Compiler:
         return self._registers[name]
 
     def _compile_single(self, value: Any) -> int:
-        """Compile an expression to float32.
-
-        Only products and tables are computed in float32; other results are converted.
-        """
+        """Compile an expression to float32."""
+        # Only products and tables are computed in float32; other results are converted.
         if not is_full(value, self._width):
             return self._broadcast(value, "single")
         return self._make_once(
@@ -113,10 +104,7 @@ class Compiler:
         )
 
     def _compile_product(self, node: Node) -> int | None:
-        """Compile a product, an offset, a cosine or a sine to float32.
-
-        Returns None for all other expressions.
-        """
+        """Compile a product, an offset, a cosine or a sine to float32, or return None."""
         if node.kind != "call":
             return None
         name = node.function.__name__
@@ -148,11 +136,8 @@ class Compiler:
         return self.program.add_call(function.__name__, "single", function, RegisterRead(angle))
 
     def _compile_turned(self, function: np.ufunc, parts: list[Term]) -> int:
-        """Compile the cosine or sine of a sum of angles.
-
-        Each angle is a constant, or has one value for each packet or block. By the angle addition
-        theorem, no cosine or sine has to be computed for each point.
-        """
+        """Compile the cosine or sine of a sum of angles."""
+        # By the angle addition theorem, no cosine or sine has to be computed for each point.
         self.low += [part.low for part in parts if part.low is not None]
         depth = len(self._shape)
         fixed = sum(part.row for part in parts if part.low is None)
@@ -214,19 +199,13 @@ class Compiler:
         return register
 
     def _compile_lookup(self, node: Node, kind: str) -> int | None:
-        """Compile a lookup of table rows, or an expression of one field.
-
-        Returns None for all other expressions.
-        """
+        """Compile a lookup of table rows, or an expression of one field, or return None."""
         if node.kind == "rows":
             return self._look_up_rows(node, kind)
         return self._compile_field(node, kind)
 
     def _compile_field(self, node: Node, kind: str) -> int | None:
-        """Load a field, or look up an expression of a single field in a table.
-
-        Returns None if neither is possible.
-        """
+        """Load a field or look it up in a table; return None if neither is possible."""
         source = get_only_field(node)
         if source is None or not is_full(source, self._width):
             return None
@@ -314,10 +293,7 @@ class Compiler:
         return self.program.add_step(f"{leaf.info.path}: {dtype} at byte {offset}", kind, run)
 
     def _look_up_rows(self, node: Node, kind: str) -> int | None:
-        """Compile a lookup of rows of a table.
-
-        Returns None if the result is not a sequence of whole rows of the table.
-        """
+        """Compile a lookup of rows of a table; return None if the rows are not whole."""
         index, table = node.args
         inner = table.shape[1]
         inner_shape = self._shape[count_used_axes(index.shape) :]
@@ -335,11 +311,7 @@ class Compiler:
         return self.program.add_step(f"rows of a table of {len(table) - 1} x {inner}", kind, run)
 
     def _compile_sum(self, node: Node) -> int | None:
-        """Compile a sum; terms with one value for each packet or block are added first.
-
-        Returns None if there are no such terms, or if a term with a value for each point is
-        multiplied by an array.
-        """
+        """Compile a sum; terms with one value for each packet or block are added first."""
         parts = split_sum(node, self._width)
         low = [part for part in parts if part.full is None]
         full = [part for part in parts if part.full is not None]

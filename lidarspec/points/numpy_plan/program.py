@@ -1,11 +1,8 @@
 """Run a program of NumPy calls on registers, for one chunk of packets at a time.
 
-A program computes flat columns from frames of one layout. It does not depend on fields or
-expressions: `numpy_plan.compiler` appends the steps. A step computes one register from other
-registers, from the frames, or from values of the batch. A register is an array of one kind for
-a chunk: float32 ("single"), float64 ("double"), indices, flags or integers. The registers of output
-columns are parts of the columns. All other registers are in scratch memory. Registers that are not
-needed at the same time share a slot of this memory, so that a chunk fits in the cache.
+A register is an array of one kind for a chunk: float32 ("single"), float64 ("double"), indices,
+flags or integers. Each step of a program computes one register. Registers that are not needed at
+the same time share memory, so that a chunk fits in the cache.
 """
 
 from __future__ import annotations
@@ -95,9 +92,8 @@ class Program(ColumnMaker):
 
     Args:
         width: the number of points of a packet.
-        safe: a function that returns whether each point has either three finite coordinates or
-            three that are nan. Its argument returns the value of a node. If the result is False,
-            the program sets all coordinates of a point to nan if one is nan.
+        safe: a function that returns whether the three coordinates of each point are either all
+            finite or all nan. Its argument is a function that returns the value of a node.
 
     Attributes:
         chunk: the number of packets of a chunk.
@@ -198,18 +194,14 @@ class Program(ColumnMaker):
 def assign_slots(
     uses: Sequence[Collection[int]], kinds: Sequence[str], own: Collection[int]
 ) -> list[int]:
-    """Return a slot for each register.
-
-    Registers of one kind that are not needed at the same time share a slot.
+    """Return a slot for each register; -1 for a register without a slot.
 
     Args:
         uses: for each step, in order, the registers that it fills or reads.
         kinds: the kind of each register.
         own: registers that have their own memory.
-
-    Returns:
-        The number of the slot of each register; -1 for a register without a slot.
     """
+    # Registers of one kind that are not needed at the same time share a slot.
     last = {register: index for index, used in enumerate(uses) for register in used}
     slots = [-1] * len(kinds)
     free = dict[str, list[int]]()
