@@ -125,7 +125,6 @@ class ChecksumWithConstant(Checksum):
     set, and ``constant + value`` in all other cases.
 
     Attributes:
-        base: the base checksum, which computes the value.
         negative: whether the value is subtracted from the constant.
     """
 
@@ -180,8 +179,7 @@ def search(
     """Return the checksums that match the frames, the simplest and likeliest first.
 
     Args:
-        frames: whole frames of any lengths; some may be damaged. The result is more certain if
-            there are more frames and if their content varies more.
+        frames: whole frames of any lengths; some may be damaged.
         quick: whether to stop after about a second. Fewer offsets and fewer CRCs are tried.
         is_possible_place: a function that returns whether a checksum may be at a place.
     """
@@ -316,7 +314,6 @@ def _list_variants(
     Args:
         computed: the result of the algorithm for each frame, (n,).
         stored: the value at the place of the checksum in each frame, (n,).
-        max_value: the largest value that can be stored.
     """
     mask = np.uint64(max_value)
     if isinstance(algorithm, Fletcher | Fold15):

@@ -322,7 +322,6 @@ def _iter_matches(
 
     Args:
         few: the frames from which candidates are calculated.
-        tried: number of combinations of place, span and bit order that were tried so far.
         by_catalogue: whether to try only the CRCs of the catalogue.
     """
     stored = samples.read_field(place, reading.order)

@@ -39,7 +39,6 @@ class DistributionNames:
     """The names in the distribution of a sensor.
 
     Args:
-        id: the id of the sensor.
         distribution: the name of the distribution; "" for "lidarspec-" followed by the id.
         vendor: the vendor's display name; "" to derive it from the id.
         model: the model's display name; "" to derive it from the id.
@@ -158,12 +157,7 @@ def _make_files(
     vectors: str,
     templates: tuple[str, str, str],
 ) -> dict[str, str]:
-    """Return the files of a distribution, as {path: text}.
-
-    Args:
-        vectors: the content of vectors.json.
-        templates: the names of the templates for README, module and tests.
-    """
+    """Return the files of a distribution, as {path: text}."""
     readme, module, tests = (fill_template(template, values, link) for template in templates)
     return {
         "pyproject.toml": fill_template("pyproject.toml", values, link),

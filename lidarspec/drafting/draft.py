@@ -81,7 +81,6 @@ class Draft:
     """The properties that were found in unknown frames.
 
     Attributes:
-        datagrams: whether each frame is a datagram.
         sync: the first bytes of every frame.
         size: the length of the frames, in bytes; None if it varies.
         length: the length field; None if all frames have one length.

@@ -229,8 +229,6 @@ def _iter_unknown_fields(
 
     Args:
         rows: the frames or blocks, (n, size).
-        start: offset of the first unknown byte.
-        end: offset after the last unknown byte.
         cuts: offsets at which fields must be split.
     """
     edges = {start, end, *(cut for cut in cuts if start < cut < end)}

@@ -101,8 +101,6 @@ class RisingField:
         circle: the value at which the field wraps; 0 if no wrap was seen.
         steps: the smallest, usual and largest step.
         right: the number of regular steps.
-        total: number of steps.
-        wraps: number of wraps.
         first: for a counter, the value after a wrap.
     """
 
@@ -303,7 +301,6 @@ def _find_circle(highest: int, fallen: int, usual: int) -> int:
     """Return the value at which a field wraps.
 
     Args:
-        highest: the highest value of the field.
         fallen: the sum of the decrease at a wrap and the usual step.
     """
     near = [

@@ -117,12 +117,9 @@ class ChecksumMatch:
     Attributes:
         place: the offset and size of the checksum in the frames.
         span: the covered bytes.
-        order: the byte order of the stored checksum.
         right: the number of frames with a valid checksum.
-        total: number of all frames.
         evidence_bits: the certainty: of 2**evidence_bits wrong checksums, one matches by
             coincidence.
-        source: the Python source of the algorithm.
         name: the name of a CRC in the catalogue; "" if it has none.
         is_ambiguous: whether the frames leave a choice of parameters.
         has_constant: whether the checksum includes a constant that was calculated from the frames.
@@ -366,7 +363,6 @@ def weigh_evidence(width: int, values: NDArray[np.uint64], fitted: int, tried: i
     Evidence of k bits means that of 2**k wrong checksums, one matches by coincidence.
 
     Args:
-        width: width of the checksum, in bits.
         values: the values of the frames at the place of the checksum, (n,).
         fitted: number of distinct values that were used to determine parameters.
         tried: number of checksums that were tried so far.
