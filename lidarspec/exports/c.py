@@ -249,11 +249,7 @@ static inline int {name}(const uint8_t *p, size_t n)
 
 
 def _iter_frame_functions(layout: CLayout, algorithms: Mapping[Checksum, str]) -> Iterator[str]:
-    """Yield the C functions of a frame type that read a whole frame.
-
-    Args:
-        algorithms: the name of the C function of each checksum algorithm.
-    """
+    """Yield the C functions of a frame type that read a whole frame."""
     length = layout.name("", "frame_length")
     longest = layout.message.frame.max_length
     checks = _join_statements(_iter_length_checks(layout))

@@ -98,7 +98,6 @@ class CCondition(NamedTuple):
     """A condition as a C expression.
 
     Attributes:
-        text: the expression.
         is_fixed: whether the value is the same for all elements of the arrays around the
             expression.
     """
@@ -116,7 +115,6 @@ class CEntry:
         start: the offset of the first byte of the node in the frame.
         size: the size of the node in bytes.
         depth: the number of arrays around the node.
-        conditions: the conditions under which the node is present.
         loops: the C expression of the count of each array around the node, outermost first.
         part: the part of a bit block that is read; None for any other node.
     """

@@ -36,7 +36,6 @@ class DiagramBox:
     """A box of a diagram.
 
     Attributes:
-        name: the title of the box.
         bits: the size of the field in bits; 0 if the size depends on the header.
         detail: the text below the title.
         tooltip: the full description.
@@ -314,7 +313,6 @@ class _Sheet:
     """A drawing that is made from top to bottom.
 
     Attributes:
-        parts: the SVG elements.
         top: the upper edge of the current row, in pixels.
         used: the bits of the current row that are already drawn.
         deepest: the maximum number of nested brackets so far.

@@ -204,9 +204,6 @@ def inline_block(
     """Return (attribute, instances) of a bit block that consists of a single integer.
 
     Returns None for any other block.
-
-    Args:
-        more: further keys of the attribute.
     """
     if len(block.parts) != 1 or block.parts[0].names or block.parts[0].indices or not block.name:
         return None
