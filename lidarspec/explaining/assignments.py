@@ -31,8 +31,6 @@ def parse_values(table: Schema, assignments: Sequence[str], place: str) -> dict[
     """Return the raw values of assignments "field=value", nested as in the struct.
 
     Args:
-        table: the fields of the frame.
-        assignments: texts of the form "field=value".
         place: the names of the sensor and of the frame, for error messages.
 
     Raises:
@@ -102,7 +100,6 @@ def _parse_number(text: str, unit: str, place: str, expected: str) -> tuple[Frac
 
     Args:
         unit: the unit to convert to, if the text has a unit.
-        expected: description of a valid text, for the error message.
     """
     digits, unit_text = split_unit(text)
     if unit_text:

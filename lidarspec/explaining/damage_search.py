@@ -164,12 +164,7 @@ def _undo_changes(
     values: NDArray[np.uint8],
     size: int,
 ) -> NDArray[np.uint8]:
-    """Return the damaged frame with each change undone, (number of changes, size).
-
-    Args:
-        offsets: `FrameChange.offset` of each change.
-        values: `FrameChange.value` of each change.
-    """
+    """Return the damaged frame with each change undone, (number of changes, size)."""
     columns = count_up(size)
     change_columns = offsets[:, None]
     indices = np.arange(len(offsets))
@@ -220,7 +215,6 @@ def _describe_change(
 
     Args:
         before: the values of the fields of the damaged frame, by path.
-        after: the values after the change is undone.
     """
     kind, offset, value = change
     if kind == "inserted byte":

@@ -48,9 +48,7 @@ class Explanation:
     line prints.
 
     Attributes:
-        sensor: the id of the sensor.
         frame: the frame type; "" for bytes that are not in a frame.
-        data: the bytes.
         rows: a row for each field, bit block or array element.
         fault: the first fault of the frame; None if the frame is valid.
         notes: remarks on the whole frame.

@@ -96,9 +96,8 @@ class SensorContent:
             the sensor.
         options: command-line options that select the sensor; "" if the file names the sensor.
         reading: statistics of the part that was decoded; None if the data cannot be decoded.
-        incomplete_returns: the number of incomplete groups of packets in the decoded part. A group
-            has the packets with the returns of the same firings.
-        verb: the subcommand that shows the data.
+        incomplete_returns: the number of incomplete groups of packets in the decoded part. The
+            packets of a group contain the returns of the same firings.
         info: the facts that the sensor reports about itself in the decoded part, by name.
         clock: a description of the sensor's clock in the decoded part; "" if the sensor sends no
             time.
@@ -133,8 +132,6 @@ class FileContents:
         last_ns: arrival time of the last packet, ns since 1970; None if unknown.
         last_read_ns: arrival time of the last packet that was read; None if unknown.
         whole: whether the whole file was read; if not, all counts refer to its beginning.
-        contents: the data of each sensor.
-        warnings: warnings about the file.
     """
 
     path: str

@@ -95,7 +95,6 @@ class FieldValue:
         is_unknown: whether other values of the field have names, but this value has none.
         bits: a text with the bits of the field, e.g. ".. 000001.."; "" if the field consists of
             whole bytes.
-        docs: the documentation of the field.
         start: offset of the first byte in the frame.
         masks: for each byte that contains bits of the field, a mask in which these bits are 1.
     """
@@ -186,7 +185,6 @@ class ExplainedRow:
 
     Attributes:
         offset: offset of the first byte in the frame.
-        data: the bytes.
         path: the path of the field or element; "" for bytes that are not in a field.
         values: the fields in these bytes.
         remarks: remarks on constants, checksums and missing bytes.
@@ -291,8 +289,6 @@ class FieldDifference:
         path: the path with array indices.
         before: the value in the first frame; None if the frame does not have the field.
         after: the value in the second frame; None if the frame does not have the field.
-        first: the bytes of the field in the first frame.
-        second: the bytes of the field in the second frame.
     """
 
     path: str

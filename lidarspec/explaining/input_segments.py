@@ -39,7 +39,6 @@ class InputPiece:
 
     Attributes:
         offset: offset of the first byte in the input.
-        data: the bytes.
         frame: the frame type; "" for bytes that are not in a frame; `NEAREST` for a short input
             that is probably one damaged frame.
         is_datagram: for bytes that are not in a frame, whether they are from a datagram.
