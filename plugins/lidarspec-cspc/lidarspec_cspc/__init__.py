@@ -14,12 +14,9 @@ Known gaps of the manual: The order of the checksum is missing; the grouping in 
 every captured packet. The baud rate is missing. There is no rule for packets that cross 360 degrees
 or have one sample. A COIN-D4 sends the fillers FE, FF and FA FA, which no manual mentions.
 
-Of a COIN-D4A only the vendor's driver is public. Facts about the COIN-D6 come from other people's
-captures: 10 revolutions a second, 400 points per revolution, and an unexplained frame every three
-seconds. A COIN-D4A and a COIN-D6 are assumed to report their model names. The M1C1_Mini of the
-manual's edition v1.1 is a separate sensor: samples of two bytes, replies that begin with AA 55, no
-exposure, and packets without the rotation speed. The M1CT_Coin_Plus, which sends Camsense's
-packets, is left out.
+The facts about the COIN-D4A come from the vendor's driver, and the facts about the COIN-D6 from
+published captures. Both models are assumed to report their names. The M1C1_Mini of the manual's
+edition v1.1 is a separate sensor. The M1CT_Coin_Plus, which sends Camsense's packets, is left out.
 """
 
 from __future__ import annotations
@@ -184,7 +181,6 @@ def make_data(
 
     Args:
         first: the fields of the first byte, M&T.
-        sample: the struct of one sample.
         groups: the sizes in bytes of the words into which the checksum divides a sample.
     """
     return Checksummed(

@@ -97,14 +97,10 @@ def make_packet(
     """Return the struct of a packet of a protocol version.
 
     Args:
-        version: the fields major and minor.
         channels: the array of channels in a block.
         tail: the fields between functional safety and sequence.
         block: the type of the fine azimuth, which is between azimuth and channels; None if blocks
             have no fine azimuth.
-        blocks: the type of the number of blocks.
-        imu: whether the packet can have an IMU part.
-        safety: whether the packet can have a functional safety part.
         verify_crc: whether CRCs are verified, instead of being plain fields.
     """
     crc = Int32ul if verify_crc else Int32ul * UNCHECKED_NOTE

@@ -28,7 +28,6 @@ def make_spinning_sensor(
         table: the nominal corrections of the model.
         sweep: a function that returns the values of simulated packet i.
         azimuth: the path of the field that passes 0 at the end of a scan.
-        facts: further arguments of `Sensor`.
     """
     defaults: dict[str, Any] = {
         "turn": SPEED_LIMITS_HZ,

@@ -55,7 +55,6 @@ class Geometry:
         ahead: the step straight ahead.
         end: the highest step that can be requested.
         rate: the revolutions per second.
-        kinds: the kinds of scans that the scanner sends.
     """
 
     division: int
@@ -85,8 +84,6 @@ def make_decimal(name: str, places: int, most: int = 9999) -> Any:
     """Return the struct of a decimal number, with a field for each digit.
 
     Args:
-        name: the name of the field.
-        places: the number of digits.
         most: the largest number; it limits the first digit if there are four digits.
     """
     first = most // 10 ** (places - 1) if places == 4 else 9

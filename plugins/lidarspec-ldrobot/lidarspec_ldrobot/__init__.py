@@ -233,7 +233,6 @@ def make_lidar(
         turns: simulated revolutions per second.
         correct_parallax: whether to correct the angles for the parallax.
         older_rate: points per second of older units.
-        more: further arguments of `Sensor`.
     """
     rate = POINT_RATES_HZ[name]
     return Sensor(

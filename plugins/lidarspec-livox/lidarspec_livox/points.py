@@ -94,7 +94,6 @@ def simulated_angles(shots: Any, rate: float, view: View) -> tuple[Any, Any]:
     Args:
         shots: the numbers of the shots since the start.
         rate: the number of shots per second.
-        view: the field of view.
     """
     right, left, low, high = view
     across = np.sin(2 * np.pi * 7.3 * shots / rate)

@@ -10,8 +10,7 @@ Source: Livox-SDK communication protocol 1.3.0, Livox-SDK 9306596 (livox_def.h, 
 and livox_ros_driver (lds.h: packet sizes, points a second). In livox_ros_driver, the size of a
 point of type 3 is given as 9 bytes, but is 10 bytes. Ranges and fields of view are assumed. The
 documents do not state which model sends which type of data, so all types are accepted for each
-model. Packet version 5 is assumed, because test vectors have this version, and drivers ignore the
-version. Hubs and the parameters of commands 0B to 0D are not supported.
+model. Packet version 5 is assumed. Hubs and the parameters of commands 0B to 0D are not supported.
 """
 
 from __future__ import annotations
@@ -228,7 +227,6 @@ def make_simulation(name: str, rate: float, view: View, **more: Any) -> Simulati
     Args:
         name: a key of `DATA_TYPES`.
         rate: shots per second.
-        view: the field of view.
     """
     _, count, returns, _ = DATA_TYPES[name]
     shots = np.arange(count)[:, None] if returns > 1 else np.arange(count)
@@ -262,7 +260,6 @@ def make_message(packet_type: int, number: tuple[int, int] | None, *members: Any
     Args:
         packet_type: `REQUEST`, `REPLY` or `NOTIFICATION`.
         number: the command set and id; None for the frames of several commands.
-        members: the data.
     """
     header = Struct(
         SOF,

@@ -158,8 +158,6 @@ def make_message(cmd_id: int | None, *members: Any, ack: bool = True, lidar: boo
 
     Args:
         cmd_id: the command; None for frames of several commands.
-        ack: whether the message is a reply.
-        lidar: whether the Lidar sends the message.
     """
     header = Struct(
         SOF,
@@ -297,7 +295,6 @@ def make_simulation(rate: float, view: View, shots: Any = SHOTS, **more: Any) ->
 
     Args:
         rate: the number of shots per second.
-        view: the field of view.
         shots: the numbers of the shots in a packet.
     """
     points = len(shots)

@@ -5,8 +5,7 @@ Numbers are big-endian. The C16 is in the module `c16`.
 Source: the vendor's ROS drivers (lslidar_driver.cc of the edition for the N10P;
 lslidar_x10_driver.cpp of Lslidar_ROS2_driver V5). Packets of the N10 and N10P end with a checksum,
 which is a sum. Packets of the M10 family have no checksum, only constant bytes at both ends. The
-value that the older driver calls speed is the time for 15 degrees, in microseconds: 4167 at 10
-revolutions a second, and 3460 to 3490 for an M10P at 12 revolutions a second.
+value that the older driver calls speed is the time for 15 degrees, in microseconds.
 
 Angles are clockwise in the older driver and in this module, but counter-clockwise in the newer
 driver. For an M10, both drivers divide 15 degrees by the number of samples that are not FFFF. This
@@ -304,7 +303,6 @@ class Model:
     """One row of the table of models.
 
     Attributes:
-        data: the frame of its packets.
         hertz: the lowest and the highest number of revolutions per second.
         clock: the clock in the packets; None if they have no time.
         status: how the model was verified, as in `Sensor`.

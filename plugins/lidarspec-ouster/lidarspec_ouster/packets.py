@@ -265,7 +265,6 @@ def make_imu_frame(samples: int, rotation: Rotation) -> Frame:
 
     Args:
         samples: samples per packet with NMEA; 0 for a LEGACY packet.
-        rotation: rotation from the IMU to the sensor.
     """
     read_imu = partial(imu_samples, path="samples" if samples else "", rotation=rotation)
     if not samples:
@@ -304,7 +303,6 @@ def imu_samples(f: Fields, path: str, rotation: Rotation) -> Imu:
     Args:
         path: the array of measurements in an ACCEL32_GYRO32_NMEA packet; "" for the single
             measurement of a LEGACY packet.
-        rotation: rotation from the IMU to the sensor.
     """
     if path:
         values = getattr(f, path)

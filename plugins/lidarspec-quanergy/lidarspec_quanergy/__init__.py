@@ -175,10 +175,8 @@ def make_lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: 
     """Return the sensor of one model; the models differ only in their laser angles.
 
     Args:
-        model: the name of the model.
         elevation: elevation in radians, one per laser.
         other: the last part of the other model's id.
-        facts: further arguments of `Sensor`.
     """
     kinds = {
         "data": (THREE_RETURNS, three_return_points, {"api": FINE_STEP_VERSION}),

@@ -13,8 +13,7 @@ its examples of angles, the vertical angle 00 05 d6 is 14.94 degrees and not 14.
 horizontal angle 01 01 96 is -4.06 degrees. The second part of a time is in nanoseconds in appendix
 B.13, but in microseconds in Table 9 and the capture. The type is at byte 31 in the manual of the
 Helios-1610, but at byte 30 in rs_driver and the capture. In rs_driver, the second firing of a 16P
-is 27.68 us after the first. According to the manual, the azimuth of the second firing is half a
-step further, and blocks are about 100 us apart, which requires 55.56 us. The firing times of 32
+is 27.68 us after the first; the azimuths in the manual require 55.56 us. The firing times of 32
 lasers are from rs_driver, 1.73 us apart; nebula has other times, up to 48 us.
 
 The published capture with the name of the 16P is of a Helios-5515: its packets have type 6, and its

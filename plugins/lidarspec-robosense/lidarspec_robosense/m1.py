@@ -14,11 +14,9 @@ for mems_tmp gives -46 degC for the guide's own capture, so the raw byte is kept
 packets in a frame, which result in 787 500 points.
 
 From byte 28 on, DIFOP has one of three layouts. `difop` is the layout of rs_driver since December
-2023. `difop_fov` is the layout of earlier editions of the driver, and contains the field of view.
-`difop_guide` is the layout of the M1P user guide. Packets do not identify their layout. A packet is
-therefore read with the first of these layouts in which the return mode, the synchronisation mode
-and status, and the microseconds have possible values. If no layout fits, the packet is
-`difop_other`.
+2023. `difop_fov` is the layout of earlier editions of the driver. `difop_guide` is the layout of
+the M1P user guide. Packets do not identify their layout, so a packet is read with the first layout
+in which its values are possible. If no layout fits, the packet is `difop_other`.
 """
 
 from __future__ import annotations
@@ -199,7 +197,7 @@ def pace(f: Fields) -> Any:
 
 
 def points(f: Fields) -> Polar:
-    """Return the sent ranges and directions, which have REP-103 axes.
+    """Return the points from the sent ranges and directions, in REP-103 axes.
 
     Source: M1P user guide, page 13.
     """

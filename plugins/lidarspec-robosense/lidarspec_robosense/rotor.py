@@ -83,11 +83,9 @@ def make_blocks(
     """Return the array of blocks; a block has one azimuth.
 
     Args:
-        count: the number of blocks per packet.
         lasers: the number of channels of a firing.
         step: the size of a distance step in metres.
         firings: the number of groups of channels in a block, 1 or 2.
-        flag: the type of the first bytes of a block.
     """
     channel = Struct("distance" / Scaled(Int16ub, step, "m") * "0: no return", "intensity" / Int8ub)
     channels: Construct = "channels" / Array(lasers, channel)
@@ -368,7 +366,6 @@ def rotation_values(i: int, shots: int, period: float, **others: Any) -> dict[st
     Args:
         shots: shots per packet.
         period: seconds from shot to shot.
-        others: values of further fields.
     """
     time = i * shots * period
     azimuth = np.round((i * shots + np.arange(shots)) * period * FACTORY_SPEED_HZ * 360, 2) % 360

@@ -17,9 +17,8 @@ of a pair is the last return, and the second value is the strongest return.
 
 No table of nominal angles was found. The angles are assumed to be evenly spaced over 40 degrees,
 with the lowest laser first. 40 degrees is the field of view in the data sheets for 128 and 80
-lasers. Clouds are marked as nominal until the first DIFOP packet arrives. It is also assumed that
-a packet with the series number 5 is from a Ruby Plus. The range limits are from rs_driver, and are
-the same for all models.
+lasers. It is also assumed that a packet with the series number 5 is from a Ruby Plus. The range
+limits are from rs_driver, and are the same for all models.
 """
 
 from __future__ import annotations
@@ -200,7 +199,6 @@ def make_model(id: str, name: str, rotor: Rotor, relative: str, variant: Any = N
     """Return the sensor of a Ruby or Ruby Plus; the id of a Ruby Plus contains "plus".
 
     Args:
-        rotor: its firing times and geometry.
         relative: the id of the corresponding model of the other series.
         variant: the firing times that are used if packets identify the model as an 80V.
     """

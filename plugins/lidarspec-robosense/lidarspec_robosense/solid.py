@@ -10,7 +10,7 @@ the bytes that they cover are not public; the CRC of the E1 is called AUTOSAR E2
 assumed that the other models count packets from 1, as the M1 does. It is also assumed that frames
 with dual return have twice as many packets, except for the MX, whose points have two radii. The IMU
 of the E1 is assumed to measure in g and rad/s like the IMU of the Airy, because rs_driver reads
-both in the same way. In the manual, the bytes of the IMU are reserved.
+both in the same way.
 """
 
 from __future__ import annotations
@@ -92,7 +92,6 @@ def make_packet(
         offset: the type of a block's time offset.
         parts: the fields of a block between the time offset and the channels.
         channel: the fields of a channel.
-        tail: the fields after the blocks.
     """
     time = "time_offset" / Scaled(offset, 1e-6, "s") * "relative to the time of the packet"
     return Struct(

@@ -44,10 +44,7 @@ def send(sensor: str, seconds: float, place: str, notes: str) -> None:
     """Send simulated packets in real time, and store the time of the last packet of each scan.
 
     Args:
-        sensor: the id of the sensor.
-        seconds: how long to send.
         place: the path of the pseudo-terminal to create; "" to send by UDP.
-        notes: the file for the times.
     """
     spec = ls.sensor(sensor)
     frames = list(simulate(spec, 20000))
@@ -83,9 +80,6 @@ def subscribe(kind: str, topic: str, seconds: float, notes: str) -> None:
 
     Args:
         kind: the message type in `sensor_msgs`.
-        topic: the name of the topic.
-        seconds: how long to receive.
-        notes: the file for the times and sizes.
     """
     import rclpy
     from sensor_msgs import msg
@@ -113,8 +107,6 @@ def publish(kind: str, size: int, rate: float, seconds: float, notes: str) -> No
         kind: the message type in `sensor_msgs`.
         size: size of each message, in bytes.
         rate: messages per second.
-        seconds: how long to publish.
-        notes: the file for the times.
     """
     import rclpy
     from sensor_msgs import msg

@@ -27,9 +27,6 @@ class MessageStamps:
 
     Args:
         wall: the host's clock, for a live sensor; None if a recording is played.
-
-    Attributes:
-        clock: converts the sensor's clock to the host's.
     """
 
     def __init__(self, wall: HostClock | None) -> None:

@@ -101,7 +101,6 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
     """Run the node until it is interrupted or its input ends.
 
     Args:
-        given: parameters, by name.
         ros_args: the words of the command line that are for ROS.
 
     Raises:

@@ -52,8 +52,8 @@ class LidarNode(LifecycleNode):
 
     Args:
         given: parameters that have priority over parameters of the command line and of files.
-        max_cloud_bytes: the largest size of a cloud that is not lost if subscribers use the
-            reliability "best effort"; None if unknown.
+        max_cloud_bytes: the largest cloud that reaches subscribers with the reliability "best
+            effort", in bytes; None if unknown.
 
     Attributes:
         failure: the error that prevented the configuration, or that ended reading; None if there

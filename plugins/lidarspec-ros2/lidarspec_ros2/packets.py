@@ -53,7 +53,6 @@ class PacketTransport(LiveTransport):
 
     Args:
         label: the source as the user wrote it.
-        topic: the name of the topic.
         datagrams: whether each packet is a datagram.
     """
 

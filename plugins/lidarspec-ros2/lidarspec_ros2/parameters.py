@@ -310,8 +310,7 @@ class Settings:
         """Open the source of the parameters, and return the device.
 
         Args:
-            record: a function that makes a log, which publishes the packets. It is called if the
-                parameter `publish_packets` is set.
+            record: a function that makes a log, which publishes the packets.
 
         Raises:
             LidarSpecError: if a parameter is invalid, or the source cannot be opened.

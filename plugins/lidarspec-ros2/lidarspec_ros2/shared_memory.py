@@ -2,9 +2,9 @@
 
 Fast DDS passes messages to other processes on the same computer in a segment of shared memory,
 which the publisher owns. The segment has 512 KiB, unless a profile sets another size. A cloud of
-several megabytes is sent in fragments, which overwrite each other in this segment. With best
-effort, most clouds are then lost. The node therefore provides a profile with a larger segment.
-Subscribers need no profile.
+several megabytes is sent in fragments, which overwrite each other in this segment. Most of these
+clouds are lost if subscribers use the reliability "best effort". The node therefore provides a
+profile with a larger segment.
 
 An environment variable names the file with the profile. Fast DDS reads this file once, when the
 first participant of a process is created. `use_profile` sets the variable only for that time.
@@ -72,8 +72,8 @@ class SharedMemory:
 
     Attributes:
         segment_bytes: size of the segment in the node's profile; 0 if the node provides no profile.
-        max_cloud_bytes: the largest size of a cloud that is not lost if subscribers use the
-            reliability "best effort"; None if unknown.
+        max_cloud_bytes: the largest cloud that reaches subscribers with the reliability "best
+            effort", in bytes; None if unknown.
         notice: a message for the log about the node's profile; "" if there is no profile.
         warning: a message for the log that clouds may be lost; "" if there is no such danger.
     """

@@ -55,13 +55,11 @@ class Topics:
 
     Args:
         played: whether a file is played; its time is published on /clock if `use_sim_time` is set.
-        max_cloud_bytes: the largest size of a cloud that is not lost if subscribers use the
-            reliability "best effort"; None if unknown.
+        max_cloud_bytes: the largest cloud that reaches subscribers with the reliability "best
+            effort", in bytes; None if unknown.
 
     Attributes:
-        stamps: the times of messages.
         sent: the number of published messages, by topic.
-        active: whether messages are published.
         fault: the reason why the requested planar scan cannot be made; "" if it can.
         latency_s: seconds from the arrival of the last packets of a scan to its publication.
 

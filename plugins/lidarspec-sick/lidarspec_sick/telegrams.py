@@ -83,7 +83,6 @@ def make_channel(
 
     Args:
         content: the name of the content, as sent.
-        values: the type of a sample.
         first: whether it is the first channel, whose number of samples applies to all channels.
         name: the name of the field, by default the content in lower case.
     """

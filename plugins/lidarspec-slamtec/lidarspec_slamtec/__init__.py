@@ -20,9 +20,8 @@ Requests, descriptors, and replies with information and configuration were verif
 recorded communication of a live A1. Nodes, express and ultra capsules were verified with bytes that
 were built by the rules of the SDK. Dense, ultra-dense and HQ capsules were verified with points
 that were calculated by hand with the SDK's formulas. It is not known whether a C1 supports the
-speed command. According to the SDK's rule for model numbers, it would use PWM. An S2L is assumed to
-have the model numbers of an S2, so these models cannot be distinguished. A T1 receives requests and
-sends its stream over UDP.
+speed command. An S2L is assumed to have the model numbers of an S2, so these models cannot be
+distinguished. A T1 receives requests and sends its stream over UDP.
 """
 
 from __future__ import annotations

@@ -39,7 +39,6 @@ class Mode:
     """A scan mode.
 
     Attributes:
-        name: its name.
         us_per_sample: microseconds from point to point.
         max_range: the longest range in metres.
         kind: the type of its descriptor.

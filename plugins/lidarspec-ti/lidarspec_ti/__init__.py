@@ -61,9 +61,7 @@ def make_part(kind: int, size: int, *members: Any) -> Struct:
     """Return the struct of a part with arrays of elements.
 
     Args:
-        kind: the type of the part.
         size: bytes per element. Bytes that do not fill an element are kept as `rest`.
-        members: the arrays.
     """
     return Struct(
         "type" / Const(kind, Int32ul),

@@ -6,13 +6,11 @@ Source: velodyne_decoder (calibration files, calib_db.cpp, packet_decoder.cpp) a
 ros-drivers/velodyne (rawdata), which cite the vendor's user manuals: laser angles, firing times,
 focal distances. Lasers have vertical offsets, which result from the focal distance. The offsets are
 documented for the VLP-16 (11.2 mm at -15 degrees). ros-drivers and nebula ignore the offsets, so
-their z differs from that of this module by up to 11 mm (VLP-16), 17 mm (HDL-32E), 20 mm (VLP-32C)
-and 27 mm (VLS-128).
+the z values of this module differ by up to 27 mm.
 
-Sources contradict each other on the firing times of a VLS-128. In ros-drivers, one idle slot
-follows eight groups, and the first firing is 8.7 us before the packet's time. In velodyne_decoder,
-two idle slots follow eight groups, and the first firing is 7 us before the packet's time. This
-module follows velodyne_decoder. The resulting directions differ by 0.01 degrees.
+The sources contradict each other on the firing times of a VLS-128. This module follows
+velodyne_decoder: two idle slots follow eight groups, and the first firing is 7 us before the
+packet's time.
 """
 
 from __future__ import annotations

@@ -10,9 +10,8 @@ Each laser of each unit has its own corrections. They are in the unit's file (db
 sent in `status_value`, one byte in each packet. The corrections in this module are those of an
 example unit. Clouds are marked as nominal until `configure(calibration=...)` reads the unit's file.
 Not supported: the second correction of near distances (below 25 m), intensity by focal distance,
-and the calibration in the status bytes. No captured packet was available. Points of simulated
-packets differ by less than 8 cm from the points of velodyne_decoder, which applies the second
-correction. The clock has no date; the date is only in the status bytes.
+and the calibration in the status bytes. No captured packet was available. The clock has no date;
+the date is only in the status bytes.
 """
 
 from __future__ import annotations

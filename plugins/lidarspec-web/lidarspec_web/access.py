@@ -63,11 +63,8 @@ class Guard:
     """Passes on requests only if they come from the page, and adds security headers.
 
     Args:
-        app: the application that serves the requests.
         host: address on which the server listens.
         name: the host in the printed link.
-        port: port on which the server listens.
-        token: token of the printed link.
         admit: called with the client of each request that has the token.
     """
 

@@ -43,7 +43,6 @@ class ShownScan:
     """A scan that viewers show.
 
     Attributes:
-        scan: the scan.
         number: number of the shown scan, from 0.
         position: seconds from the first scan of the source.
         sent: arrival time of the last packet of the scan, seconds since 1970. For a file, it is the
@@ -76,8 +75,6 @@ class Broadcast:
     """Reads a device for viewers. It is a context manager that closes the device.
 
     Args:
-        source: the source as typed by the user.
-        device: an open device.
         reopen: a function that opens the source again; called to seek in a file.
         select: the scans to show; by default all.
         switch: starts and stops recordings of a live source; None for a file.
@@ -87,7 +84,6 @@ class Broadcast:
         backlog: the newest bytes.
         paused: whether a file is paused.
         speed: speed of a file, relative to real time.
-        warnings: warnings of the device.
         info: facts about the device, for example its serial number, by name.
         clock: a description of the sensor's clock; "" if the sensor sends no time.
         history: the statistics of the last minute, one dict for each second.

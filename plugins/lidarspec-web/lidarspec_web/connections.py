@@ -39,8 +39,8 @@ class Connections:
     """The connections of a server. All methods run in its event loop.
 
     Args:
-        report: called once, with a line of text, if connections had to be closed because there were
-            too many.
+        report: called once with a line of text, if connections were closed because there were too
+            many.
     """
 
     def __init__(self, report: Callable[[str], None]) -> None:
@@ -137,11 +137,7 @@ class Connections:
 
 
 class ErrorReporter:
-    """Reports errors of the event loop: each kind of error once, in one line.
-
-    Args:
-        report: called with the line.
-    """
+    """Reports errors of the event loop: each kind of error once, in one line."""
 
     def __init__(self, report: Callable[[str], None]) -> None:
         self._report = report

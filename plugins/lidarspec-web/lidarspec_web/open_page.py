@@ -4,8 +4,7 @@ A page requests each scan after it has drawn the previous scan, and receives the
 or hidden page therefore causes little work, and no page shows old data. Requests are JSON objects;
 the entry `do` is the name of the handler. Slow requests run in threads (`page_requests`).
 
-While a page is paused, a live source continues. A copy of the bytes at the time of the pause is
-kept for this page (`_frozen`).
+While a page is paused, a live source continues.
 """
 
 from __future__ import annotations
@@ -58,12 +57,7 @@ MAX_NUMBER = 1e12
 
 
 class OpenPage:
-    """Serves one page.
-
-    Args:
-        answers: makes the messages.
-        workers: the threads for slow requests.
-    """
+    """Serves one page."""
 
     def __init__(self, answers: PageMessages, socket: WebSocket, workers: Workers) -> None:
         self._answers = answers
@@ -292,7 +286,6 @@ class OpenPage:
         """Queue a slow request; the reply is sent when the request has run.
 
         Args:
-            word: the name of the request.
             work: a function that handles the request and returns the reply.
             command: the command of the sensor that the request concerns; "" if there is none.
         """

@@ -31,7 +31,6 @@ class PageMessages:
     """Makes the messages to the pages of a broadcast.
 
     Args:
-        broadcast: the broadcast that the pages show.
         control: whether commands may be sent to a real sensor.
 
     Attributes:
@@ -114,7 +113,6 @@ class PageMessages:
         """Return a frame with every byte explained.
 
         Args:
-            stored: the frame.
             why: the reason why the frame is shown: "last", "number" or "point".
             point_origin: the origin of the point that the page has requested; None for a frame that
                 was not requested by a point.
@@ -171,7 +169,6 @@ class PageMessages:
         """Return the bytes of a command, explained.
 
         Args:
-            name: name of the command.
             texts: its arguments as typed, by name.
 
         Raises:

@@ -64,7 +64,6 @@ class PageRequest:
     """A slow request.
 
     Attributes:
-        word: the name of the request.
         command: the command of the sensor that the request concerns; "" if there is none.
         work: a function that handles the request. It returns the reply; None for no reply.
     """
@@ -78,7 +77,6 @@ class RequestQueue:
     """Requests of one page that run one after another, in a thread.
 
     Args:
-        executor: provides the thread.
         finish: called with each request and its reply, or its exception.
     """
 

@@ -40,7 +40,6 @@ class DamagedBytes:
     Attributes:
         number: number of the damaged piece, from 0.
         offset: offset in the input.
-        size: number of bytes.
         at: arrival time of the frame after these bytes, ns since 1970; -1 if it is unknown.
         data: the bytes; if there are too many, only the first.
         is_datagram: whether the bytes are one whole datagram.
@@ -71,9 +70,7 @@ class StoredFrame:
     Attributes:
         number: number of the frame, from 0; None if the bytes are from a scan, not from the
             backlog.
-        frame: the frame type.
         at: arrival time, ns since 1970; -1 if it is unknown.
-        data: the bytes.
     """
 
     number: int | None
@@ -91,7 +88,6 @@ class _DecoderInput:
         buffer: an array with the bytes of this input, and possibly further bytes.
         starts: the offset of each part in the buffer. A stream has one part; otherwise, each
             datagram is a part.
-        sizes: sizes of the parts, in bytes.
     """
 
     offset: int
@@ -136,7 +132,6 @@ class RecentBytes:
     One thread adds to it; any thread may read it.
 
     Attributes:
-        sensor: the sensor that sends the bytes.
         damaged: number of damaged pieces (`DamagedBytes`) so far.
     """
 

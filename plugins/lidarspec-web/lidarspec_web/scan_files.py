@@ -38,8 +38,6 @@ class ScanSaver:
     """Saves scans on request.
 
     Args:
-        folder: folder of the temporary files.
-        worker: provides the thread that writes the files.
         drop: closes the connection of a client that does not read its file.
     """
 

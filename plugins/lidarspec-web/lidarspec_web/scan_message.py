@@ -38,12 +38,11 @@ def make_scan_message(
     """Return a scan as a message, without points that have no return.
 
     Args:
-        scan: the scan.
         number: number of the scan; the page uses it to request the frame of a point.
         position: time of the first point, seconds since the first packet of the source.
         sent: arrival time of the last packet, seconds since 1970 by this computer's clock.
-        max_points: maximum number of points. If there are more, evenly distributed points are
-            selected, the same points in each message.
+        max_points: maximum number of points. If there are more points, evenly distributed points
+            are selected.
     """
     points = scan.points
     points.load(*COLUMNS, "valid")

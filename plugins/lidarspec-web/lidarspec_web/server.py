@@ -49,8 +49,6 @@ class PageSite:
     """Serves the page of a broadcast while its context lasts.
 
     Args:
-        broadcast: the broadcast that the page shows.
-        host: address to listen on.
         port: port to listen on; 0 for any free port.
         control: whether pages may send commands to a real sensor.
         page: the folder with the files of the page; by default the folder in this package.
@@ -213,11 +211,7 @@ class PageSite:
 
 
 def _find_link_host(host: str) -> str:
-    """Return the host for the link to a server.
-
-    Args:
-        host: the address on which the server listens.
-    """
+    """Return the host for the link to a server."""
     if host in ANY_ADDRESS:
         return socket.gethostname()
     if ":" in host:

@@ -24,8 +24,6 @@ class SourceServer:
     Args:
         source: port, socket, file or ``sim:`` URL.
         sensor: the sensor; None to identify it.
-        selection: the scans to show.
-        host: address to listen on.
         port: port to listen on; 0 for any free port.
         control: whether pages may send commands to a real sensor.
         report: called with a line for each page that is opened or closed.

@@ -17,8 +17,6 @@ class Model:
     """One row of the table of models.
 
     Attributes:
-        sample_format: the format of its samples.
-        baud: the baud rate.
         rate: samples per second.
         range_limits: the shortest and the longest range, metres.
         turn: the lowest and the highest number of scans per second.

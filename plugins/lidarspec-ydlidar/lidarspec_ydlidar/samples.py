@@ -23,13 +23,11 @@ class SampleFormat:
     """One format of samples.
 
     Attributes:
-        struct: the struct of a sample.
         size: bytes of a sample.
         groups: the sizes in bytes of the words into which the checksum divides a sample.
         correction: a function of the distance in metres that returns the degrees to add to the
             angle.
         slowest: the scan frequency in Hz that is sent as the raw value 0.
-        has_intensity: whether a sample has an intensity.
     """
 
     struct: Construct
