@@ -193,6 +193,7 @@ def the_simulated_sensor_answers(subject: SensorUnderTest, name: str) -> None:
         require(reply.confirmed, "LS604", "the simulated sensor sends no reply", f"commands.{name}")
         _check_learned_options(subject, name, reply)
         return
+    # A sensor whose reply depends on the arguments need not support the tried values.
     decides = callable(subject.sensor.simulation.answers.get(name))
     if not (command.args and decides):
         raise ViolationError("LS604", refused, f"commands.{name}")

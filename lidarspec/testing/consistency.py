@@ -62,6 +62,7 @@ def sweep_values_fit_their_fields(subject: SensorUnderTest, name: str) -> None:
     if sweep is None:
         return
     fields = get_codec(subject.sensor.frames[name]).schema.fields
+    # Other unsigned fields may be counters and clocks, which wrap.
     checked = {path: info for path, info in fields.items() if _is_limited(info)}
     for number in range(FITTED_PACKETS):
         for path, value in sweep(number).items():

@@ -420,6 +420,7 @@ def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
                 own = {leaf.offset}
             else:
                 own = {leaf.offset + part.byte for part in leaf.elements[0].segments}
+            # Many checksums begin after the header, so they need not cover the bytes before.
             if not own <= under and max(own) > min(under):
                 reported.add(path)
                 yield (

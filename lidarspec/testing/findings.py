@@ -1,6 +1,6 @@
 """The findings of `lidarspec check` and the test kit, and their rules.
 
-A property that does not hold raises `ViolationError`, which has a `Finding`.
+A property that does not hold raises `ViolationError`, which becomes a `Finding`.
 """
 
 from __future__ import annotations

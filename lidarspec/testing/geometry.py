@@ -360,6 +360,7 @@ def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
             f"if {path} increases, the points turn {words[sense]}; with vendor_axes"
             f" {', '.join(axes or ())}, they must turn {words.get(expected)}"
         )
+        # Golden vectors with points in two quadrants are better evidence than the axes.
         is_proven = name in subject.placed
         require(is_proven or expected in (0, sense), "LS511", message, f"{name}.points")
         return

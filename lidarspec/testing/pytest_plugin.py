@@ -50,8 +50,8 @@ def sensor(request: pytest.FixtureRequest) -> Sensor:
 def virtual_port(request: pytest.FixtureRequest) -> Iterator[Callable[..., Served]]:
     """Put a simulated sensor on a real port until the test ends.
 
-    The fixture is the function `lidarspec.testing.fixtures.virtual_port`. Its first argument is an
-    id or a Sensor, by default the test's own `sensor`. Its result has a `path` to open.
+    The fixture is a function like `lidarspec.testing.fixtures.virtual_port`. Its first argument is
+    an id or a Sensor, by default the test's own `sensor`. Its result has a `path` to open.
     """
     from lidarspec.testing import fixtures as ports
 
