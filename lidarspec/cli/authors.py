@@ -119,11 +119,7 @@ def new(
 
 
 def _draft_files(names: DistributionNames, link: str | None, capture: str) -> dict[str, str]:
-    """Draft the frames in a capture, and return the files of a distribution by name.
-
-    If the capture has several senders or ports, the packets of the pair (sender, receiving port)
-    with the most bytes are used.
-    """
+    """Draft the frames in a capture, and return the files of a distribution by name."""
     groups: dict[object, list[Chunk]] = {}
     with contextlib.closing(open_transport(capture)) as opened:
         for chunk in read_beginning(opened, MAX_CAPTURE_BYTES):

@@ -167,8 +167,6 @@ class _AnswerLog:
     def await_reply(self, number: int, seconds: float) -> list[Chunk]:
         """Wait for the end of a reply, and return its chunks.
 
-        Waits until no data arrives for `REPLY_SILENCE_S`, but at most `seconds`.
-
         Args:
             number: number of chunks that were received before the reply.
             seconds: maximum waiting time.
@@ -194,10 +192,7 @@ def _write_bytes(
     as_json: bool,
     output: str | None,
 ) -> None:
-    """Send bytes, and print an explanation of the reply.
-
-    Data frames are not explained, only counted.
-    """
+    """Send bytes, and print an explanation of the reply."""
     _refuse_file(device, source)
     sensor = device.sensor
     before = len(answer.chunks)

@@ -129,8 +129,6 @@ def clock(
 def diagnose_clock(source: str, sensor_id: str | Sensor | None, seconds: float) -> Diagnosis | None:
     """Return the finding of `doctor` about the clock of a source with valid data.
 
-    A clock that is not synchronized is no problem, because many sensors are used this way.
-
     Returns:
         None if the sensor sends no time, or cannot be opened again.
     """
@@ -149,10 +147,7 @@ def diagnose_clock(source: str, sensor_id: str | Sensor | None, seconds: float) 
 
 
 def _read_all(clocks: Sequence[SourceClock], duration: float | None) -> None:
-    """Read all sources in turn, until the duration has passed or the input has ended.
-
-    Without a duration, live sources are read for the default duration, and files to their end.
-    """
+    """Read all sources in turn, until the duration has passed or the input has ended."""
     began = time.monotonic()
     running = list(clocks)
     while running:

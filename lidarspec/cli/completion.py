@@ -1,8 +1,7 @@
 """Completion of the command line in bash, zsh and fish.
 
-This module extends the completion of click. `_LIDARSPEC_COMPLETE=bash_source lidarspec` prints the
-code to load into bash. For a parameter of a verb, `BY_NAME` has a function that returns the
-possible values, such as sensor ids, fields, ports, or the devices of `lidarspec.toml`.
+This module extends the completion of click. `BY_NAME` has the functions that return the possible
+values of a parameter.
 """
 
 from __future__ import annotations
@@ -38,10 +37,7 @@ WORD_BREAKS = ":="
 
 @add_completion_class
 class BashCompletion(BashComplete):
-    """click's completion for bash, with support for words that contain ``:`` or ``=``.
-
-    No blank is added after a completion that ends in ``=``, ``:`` or ``/``.
-    """
+    """click's completion for bash, with support for words that contain ``:`` or ``=``."""
 
     source_template = BashComplete.source_template.replace(
         "COMPREPLY+=($value)",
@@ -50,10 +46,7 @@ class BashCompletion(BashComplete):
     _bash_prefix = ""  # the part of the current word that bash treats as separate words
 
     def get_completion_args(self) -> tuple[list[str], str]:
-        """Return the words before the cursor, and the word at the cursor.
-
-        Bash also splits words at the characters in `WORD_BREAKS`. This method joins these words.
-        """
+        """Return the words before the cursor, and the word at the cursor."""
         args, incomplete = super().get_completion_args()
         words: list[str] = []
         for word in (*args, incomplete):
@@ -66,10 +59,7 @@ class BashCompletion(BashComplete):
         return args, incomplete
 
     def format_completion(self, item: CompletionItem) -> str:
-        """Return the part of a completion that bash inserts.
-
-        Bash keeps the word up to the last character in `WORD_BREAKS`, and replaces the rest.
-        """
+        """Return the part of a completion that bash inserts."""
         return f"{item.type},{item.value.removeprefix(self._bash_prefix)}"
 
 
@@ -95,11 +85,7 @@ def attach(command: click.Command) -> None:
 def _complete_word(
     list_names: Callable[[click.Context, str], Iterable[str]], ctx: click.Context, incomplete: str
 ) -> list[CompletionItem]:
-    """Return the possible values that begin with a word.
-
-    If no value begins with the word, and the parameter accepts files, the shell completes file
-    names.
-    """
+    """Return the possible values that begin with a word, or a request for file names."""
     items = [
         CompletionItem(name)
         for name in list_names(ctx, incomplete)
@@ -115,11 +101,7 @@ def _complete_sensors(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _complete_sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """Return devices, ports, simulated sensors, and the files that begin with a text.
-
-    If the text can only begin a file name, the result is empty, and the shell completes the file
-    name.
-    """
+    """Return devices, ports, simulated sensors, and the files that begin with a text."""
     if incomplete.startswith("sim:"):
         simulated = [f"sim:{name}" for name in registry().names()]
     else:
@@ -138,10 +120,7 @@ def _complete_sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _find_sensor(ctx: click.Context) -> Sensor | None:
-    """Return the sensor of an incomplete command; None if the command names none.
-
-    The sensor is named by -s, by a device of lidarspec.toml, or by a SOURCE like "sim:ID".
-    """
+    """Return the sensor of an incomplete command; None if the command names none."""
     if ctx.params.get("sensor_id"):
         return named_sensor(ctx.params["sensor_id"])
     source = ctx.params.get("source") or ""
@@ -188,10 +167,7 @@ def _format_path(path: str, info: FieldInfo) -> str:
 
 
 def _complete_columns(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """Return the columns that every sensor has.
-
-    The other columns of a sensor are known only when its data is read.
-    """
+    """Return the columns that every sensor has."""
     return ("range", "intensity")
 
 

@@ -309,8 +309,6 @@ def _write_imu(
 def _iter_imu(device: Device, selection: Selection) -> Generator[ImuSamples]:
     """Yield the IMU samples of the selected packets, with times by the selected clock.
 
-    Exceptions of a plugin's function are counted instead of raised.
-
     Raises:
         UsageError: if a required time is unknown, or if only some of the samples have a clock.
     """
@@ -347,16 +345,13 @@ def _choose_frames(device: Device, target: str, frame: str | None) -> Sequence[s
     """Return the frame types to write.
 
     Args:
-        device: the device.
-        target: the output file.
         frame: the requested frame type, such as "report", or type of parts, such as
             "report.tags.temperature"; None for all frame types that the sensor sends.
 
     Raises:
         UnknownFrame: for a frame type that the sensor does not send.
         UnknownField: for parts that the frame does not have.
-        UsageError: if `frame` is None, the sensor sends several frame types, and the file format
-            can contain one type.
+        UsageError: if `target` can contain one frame type, and `frame` does not say which.
     """
     sensor = device.sensor
     frames = sensor.incoming
@@ -420,8 +415,6 @@ def _select_frames(
     device: Device, types: Sequence[str], selection: Selection, count: int | None
 ) -> Generator[dict[str, Packets]]:
     """Yield batches with the selected frames and their parts, without empty batches.
-
-    When the generator ends or is closed, it prints warnings about the clock.
 
     Args:
         types: the frame types, and the types of parts.
@@ -549,7 +542,6 @@ def _open_packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | No
     """Open a file a second time, and yield an iterator over its datagrams.
 
     Args:
-        source: the file.
         wanted: if False, the file is not opened and None is yielded.
 
     Raises:
@@ -629,9 +621,6 @@ def _detect_sensor(source: str, target: str) -> Sensor:
 
 def _make_no_data_error(device: Device, target: str, content: str = "") -> Exception:
     """Return the error that explains why a file contains no data of the sensor.
-
-    The reason is that the file is empty or damaged, or that it has only other types of frames, data
-    of another sensor, or no lidar data.
 
     Args:
         content: the searched content, such as a frame type or "IMU samples"; "" for points.

@@ -1,7 +1,6 @@
 """Report a failure as one message on standard error, and an exit code.
 
-The exit code depends on the cause: the command line, the source, its data or the device. A
-traceback is printed only with --verbose or LIDARSPEC_DEBUG.
+A traceback is printed only with --verbose or LIDARSPEC_DEBUG.
 """
 
 from __future__ import annotations
@@ -97,11 +96,7 @@ def _format_message(error: Exception) -> str:
 
 
 def _find_next_command(error: Exception, command: str, verb: str) -> str:
-    """Return the command to suggest after an error.
-
-    If a sensor is unknown and a plugin fails to load, the plugin may provide the sensor. The
-    command is then `lidarspec plugins`.
-    """
+    """Return the command to suggest after an error."""
     from lidarspec.plugins import registry
 
     if isinstance(error, errors.UnknownSensor):

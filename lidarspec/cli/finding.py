@@ -329,10 +329,7 @@ def detect(
 
 
 def _find_exit_code(source: str | None, verdicts: Sequence[Verdict]) -> int:
-    """Return the exit code if no sensor fits.
-
-    It is `DEVICE` if the source is live and no data arrived, else `NO_DATA`.
-    """
+    """Return the exit code if no sensor fits."""
     is_live = source is None or live_address(source) is not None
     is_silent = is_live and not any(verdict.sample.size for verdict in verdicts)
     if is_silent:
@@ -513,10 +510,7 @@ def _iter_conclusions(
 
 
 def _find_uninstalled(verdicts: Sequence[Verdict]) -> list[KnownSensor]:
-    """Return sensors that are not installed but may have sent most of the bytes.
-
-    Returns an empty list if an installed sensor fits.
-    """
+    """Return sensors that are not installed but may have sent most of the bytes."""
     if any(verdict.scores or verdict.fault for verdict in verdicts):
         return []
     largest = max(

@@ -193,7 +193,7 @@ def listing(
 
     Args:
         at: the offset of a byte; the title names the field at this offset.
-        every: whether to draw the bits of every element of an array, instead of only the first.
+        every: whether to draw the bits of all elements of an array, or of the first element.
         verdicts: whether to add the damage of each piece to its title.
     """
     for index, (piece, part) in enumerate(parts):
@@ -439,7 +439,7 @@ def _find_sensor(
 
     Args:
         sample: the bytes.
-        sensor_id: the named sensor; None to find one.
+        sensor_id: the named sensor; None to find a sensor.
         damaged: whether to return the most similar sensor if the bytes contain no valid frame.
 
     Returns:
@@ -482,10 +482,7 @@ def _format_raw(raw: Any) -> str:
 
 
 def to_json_values(parsed: Any) -> Any:
-    """Return a parsed frame as JSON values.
-
-    Bytes become hexadecimal text. NaN and infinity become null.
-    """
+    """Return a parsed frame as JSON values."""
     if isinstance(parsed, dict):
         return {
             name: to_json_values(value)

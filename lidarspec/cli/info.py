@@ -26,10 +26,7 @@ def info(files: Sequence[str], as_json: bool, output: str | None) -> None:
     has_unknown_file = False
 
     def iter_texts() -> Iterator[str]:
-        """Yield texts about each file.
-
-        Sets `has_unknown_file` if a file has no known sensor.
-        """
+        """Yield texts about each file."""
         nonlocal has_unknown_file
         for file in files:
             contents = read_contents(file)

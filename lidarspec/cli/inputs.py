@@ -1,8 +1,7 @@
 """Read the input of verbs, and explain why it contains no frame.
 
-The input is hexadecimal text, a file, standard input or a configured device. The modules for
-sources, files and detection are imported inside functions. Verbs that only read hexadecimal text of
-a named sensor do not need these modules, and start faster without them.
+The input is hexadecimal text, a file, standard input or a configured device. Some modules are
+imported inside functions, so that verbs start faster that do not need these modules.
 """
 
 from __future__ import annotations
@@ -169,8 +168,6 @@ def _iter_standard_input(file: FileTransport) -> Iterator[Chunk]:
 def read(words: Sequence[str]) -> SampleBytes:
     """Return the first bytes of the input that command-line arguments name.
 
-    At most `MAX_INPUT_BYTES` are returned.
-
     Raises:
         UsageError: for text that is neither hexadecimal nor a file.
         SourceError: for a file that cannot be read.
@@ -203,15 +200,13 @@ def refuse_overwriting(
 ) -> None:
     """Raise an error if a verb must not overwrite its output file.
 
-    A symbolic link to an input is recognised as the input.
-
     Args:
         target: the output file or files.
         inputs: SOURCEs, file names, and sensors whose options may be file names.
         force: whether the verb may overwrite existing files. Inputs are never overwritten.
 
     Raises:
-        UsageError: if an output file is an input, or if it exists and `force` is false.
+        UsageError: if an output file is an input, or if an output file exists and `force` is false.
     """
     existing = [
         file
@@ -238,10 +233,7 @@ def refuse_overwriting(
 
 
 def _iter_read_files(argument: str | Path | Sensor | None) -> Iterator[str | int]:
-    """Yield the files that an argument of a verb may name; 0 for standard input.
-
-    Each part of the argument that could be a path is yielded, so some of the files may not exist.
-    """
+    """Yield the files that an argument of a verb may name; 0 for standard input."""
     if isinstance(argument, Sensor):
         yield from (
             str(value) for value in argument.options.values() if isinstance(value, str | Path)
@@ -294,10 +286,7 @@ def no_frame_error(sensor: Sensor, sample: SampleBytes) -> WireError:
 
 
 def nearest_fault_error(sample: SampleBytes) -> WireError:
-    """Return the error for an input that no sensor fits.
-
-    If the bytes begin like a frame, this is the error of the sensor that parsed most of the frame.
-    """
+    """Return the error for an input that no sensor fits."""
     from lidarspec.detect.identification import find_nearest_fault
     from lidarspec.detect.uninstalled_sensors import suggest_installation
 
@@ -321,10 +310,7 @@ def nearest_fault_error(sample: SampleBytes) -> WireError:
 
 
 def _make_wrong_checksums_error(sample: SampleBytes) -> WireError | None:
-    """Return an error if the input has frames of a sensor, all with wrong checksums.
-
-    Returns None if the input has no such frames.
-    """
+    """Return an error if the input has frames of a sensor, all with wrong checksums."""
     from lidarspec.detect.identification import find_wrong_checksums
 
     fault = find_wrong_checksums(sample.chunks, datagrams=sample.datagrams)
@@ -336,11 +322,7 @@ def _make_wrong_checksums_error(sample: SampleBytes) -> WireError | None:
 
 
 def no_scan_error(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
-    """Return the error for a source without a scan.
-
-    The error names the cause: the plugin raised an exception, a file has no data frames, a device
-    has sent nothing, or the bytes are not frames.
-    """
+    """Return the error for a source without a scan, which names the cause."""
     sensor = device.sensor
     stats = device.stats
     if (failure := stats.failure(sensor.id)) is not None:
@@ -387,8 +369,7 @@ def conclude(device: Device) -> None:
 
     Raises:
         PluginError: if the plugin raised an exception for some packets.
-        click.exceptions.Exit: with exit code 1, if a part of the source was corrupt and could not
-            be read.
+        click.exceptions.Exit: with exit code 1, if a corrupt part of the source could not be read.
     """
     failure = device.stats.failure(device.sensor.id)
     for name, value in device.learned.items():
@@ -423,8 +404,7 @@ def identify_file(sensor: Sensor, source: str) -> tuple[str, str] | None:
     """Identify a file that has no data frame of `sensor`.
 
     Returns:
-        A description of its content, and the command-line options to read it; None if no sensor
-        fits.
+        A description of the content, and the options to read the file; None if no sensor fits.
     """
     from lidarspec.detect.identification import format_sensor_options, identify_sample
 
@@ -450,10 +430,7 @@ def identify_file(sensor: Sensor, source: str) -> tuple[str, str] | None:
 
 
 def require_points(device: Device, source: str) -> None:
-    """Raise a UsageError for a sensor without points.
-
-    The error suggests a command that prints the frames.
-    """
+    """Raise a UsageError for a sensor without points."""
     sensor = device.sensor
     if not sensor.has_points:
         frames = ", ".join(sensor.incoming)

@@ -25,11 +25,7 @@ STYLES = {
 
 
 def emit_lines(lines: Iterable[Line], output: str | None) -> None:
-    """Print each line when it is made, with colours only on a terminal.
-
-    Lines are folded to the width of the terminal. NO_COLOR and FORCE_COLOR are respected. Output to
-    a pipe is not folded.
-    """
+    """Print each line when it is made, with colours only on a terminal."""
     may_be_coloured = sys.stdout.isatty() or "FORCE_COLOR" in os.environ
     if output is not None or not may_be_coloured:
         emit_parts(map(plain_text, lines), output)

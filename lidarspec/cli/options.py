@@ -1,7 +1,4 @@
-"""Options that several verbs share, and the types of their values.
-
-All verbs that read scans have the same options to select scans.
-"""
+"""Options that several verbs share, and the types of their values."""
 
 from __future__ import annotations
 
@@ -51,8 +48,7 @@ def configuration_options(function: Function) -> Function:
 def sensor_words(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of `sensor_option`, without configuring the sensor.
 
-    The verb gets the arguments `sensor_id`, `options` and `calibration`, as texts, and can pass
-    them to `configure_sensor`.
+    The verb gets the arguments `sensor_id`, `options` and `calibration`, as texts.
     """
     return _add_sensor_option(_add_configuration_options(function))
 
@@ -104,11 +100,7 @@ def configure_sensor(
 
 
 def _parse_value(sensor: Sensor, name: str, text: str) -> Any:
-    """Return the value of an option given as text.
-
-    If the option accepts a number or boolean, the text is parsed as a TOML value. Any other value
-    remains a text.
-    """
+    """Return the value of an option given as text."""
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
@@ -149,8 +141,7 @@ class NumberType(click.ParamType):  # type: ignore[type-arg]  # older versions o
 
     Args:
         name: the name of the type, for help pages.
-        parse: a function that converts a text to a number. It raises ValueError or UsageError for
-            an invalid text.
+        parse: converts a text to a number; raises ValueError or UsageError for an invalid text.
         form: a description of the expected syntax, for error messages.
     """
 
@@ -208,11 +199,7 @@ def _parse_speed(text: str) -> float:
 
 
 def _parse_pair(text: str, parse: Callable[[str], Any]) -> tuple[Any, Any]:
-    """Return the values before and after a colon; None for an empty side.
-
-    The text is split at each colon in turn until both sides are valid, because dates contain
-    colons.
-    """
+    """Return the values before and after a colon; None for an empty side."""
     for index in (index for index, mark in enumerate(text) if mark == ":"):
         try:
             low, high = (
@@ -336,7 +323,7 @@ SELECTING: dict[str, Callable[[Any], Any]] = {
 
 
 def selection_options(*names: str) -> Callable[[Function], Function]:
-    """Add options that select scans. The verb gets a `Selection`.
+    """Add options that select scans, and pass a `Selection` to the verb.
 
     Args:
         names: the arguments of `Selection` for which options are added; keys of `SELECTING`.

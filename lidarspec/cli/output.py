@@ -43,10 +43,7 @@ def output_options(function: Function) -> Function:
 
 
 def output_option(function: Function) -> Function:
-    """Add ``-o/--output`` to a verb.
-
-    The output file must not be a file that the verb reads.
-    """
+    """Add ``-o/--output`` to a verb."""
 
     @functools.wraps(function)
     def refuse_and_call(*args: Any, output: str | None, **others: Any) -> Any:
@@ -70,8 +67,6 @@ def output_option(function: Function) -> Function:
 class Progress(contextlib.AbstractContextManager["Progress"]):
     """A progress line on standard error; a context manager that removes it at its end.
 
-    Nothing is shown if standard error is not a terminal.
-
     Args:
         unit: converts an amount of work to text.
         period: minimum seconds between two updates; 0 shows every text.
@@ -88,7 +83,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         """Show a text if an update is due.
 
         Args:
-            text: returns the text. It is called only if an update is due.
+            text: returns the text; called only if an update is due.
             done: (completed amount, total amount) of work, to show a bar, the rate and the
                 remaining time as well; None shows only the text.
         """
@@ -193,8 +188,6 @@ def format_size(number: float) -> str:
 def emit(content: str | bytes, output: str | None) -> None:
     """Write text or bytes to standard output or to a file.
 
-    An existing file is replaced only after the new content is complete.
-
     Raises:
         SourceError: if the file cannot be written.
     """
@@ -259,12 +252,7 @@ def _iter_items(beginning: str, items: Iterable[Any]) -> Iterator[str]:
 
 
 def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | None = None) -> str:
-    """Format rows as aligned columns, fitted to the width of a terminal.
-
-    Cells are folded only between words, so that ids and paths are not split. If this makes the last
-    column narrower than `MIN_PROSE_WIDTH`, its cells are printed on separate lines below each row.
-    Without a terminal, each row is one line.
-    """
+    """Format rows as aligned columns, fitted to the width of a terminal."""
     lines = [headers, *rows]
     if output is None and sys.stdout.isatty():
         room = shutil.get_terminal_size().columns
@@ -282,10 +270,7 @@ def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | N
 
 
 def _fit_widths(lines: Sequence[Sequence[str]], room: int) -> list[int]:
-    """Return widths of columns that fit into `room` characters, if possible.
-
-    The widest column is narrowed first. No column is narrower than its longest word.
-    """
+    """Return widths of columns that fit into `room` characters, if possible."""
     columns = list(zip(*lines, strict=True))
     widths = [max(map(len, cells)) for cells in columns]
     for index in sorted(range(len(columns)), key=lambda index: -widths[index]):
@@ -296,7 +281,7 @@ def _fit_widths(lines: Sequence[Sequence[str]], room: int) -> list[int]:
 
 
 def _fold_row(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator[str]:
-    """Yield the lines of one row. Cells without a width are printed below the row."""
+    """Yield the lines of one row, with cells without a width below the row."""
 
     def wrap(cell: str, width: int) -> list[str]:
         if len(cell) > width:
@@ -313,10 +298,7 @@ def _fold_row(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator
 
 
 def render(what: Text) -> str:
-    """Convert a text of the library rich to a string with colour codes.
-
-    rich is not used to print the text, because it ends the process if the pipe is closed.
-    """
+    """Convert a text of the library rich to a string with colour codes."""
     from rich.console import Console
 
     console = Console()

@@ -132,8 +132,7 @@ def _draw_scan(
 def _find_scan(device: Device, source: str, selection: Selection, number: int) -> Scan:
     """Return the complete scan with this number, counted from 1.
 
-    If the source has fewer complete scans, returns the last of them. If it has none, returns an
-    incomplete scan.
+    If the source has fewer complete scans, the last scan is returned.
     """
     chosen: Scan | None = None
     whole_count = 0

@@ -148,10 +148,7 @@ def _iter_lines(rows: Iterable[tuple[Units, Row]], *, as_json: bool) -> Iterator
 
 
 def _iter_points(scans: Iterable[Scan], *, every_point: bool) -> Iterator[tuple[Units, Row]]:
-    """Yield (units, row) for each point.
-
-    Points of incomplete scans at the beginning and at the end are included.
-    """
+    """Yield (units, row) for each point."""
     units: Units = UNITS
     for number, scan in enumerate(scans):
         if every_point:
@@ -480,10 +477,7 @@ def _print_by_clock(
 def _print_by_packet_time(
     feed: LiveScans | LiveFrames, lines: StatsPrinter, interval: float, lasting: float
 ) -> None:
-    """Print a line for each interval, measured by the times of the packets.
-
-    An interval contains at least one batch of packets.
-    """
+    """Print a line for each interval, measured by the times of the packets."""
     start: int | None = None
     edges = 0
     passed = 0.0

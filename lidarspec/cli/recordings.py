@@ -166,10 +166,7 @@ def _sum_up_recording(
     *,
     as_json: bool,
 ) -> None:
-    """Print a summary of a recording and the next command.
-
-    An empty recording is deleted, and an error is raised.
-    """
+    """Print a summary of a recording and the next command."""
     device = task.device
     if not recorder.records:
         if not recorder.discard():
@@ -204,11 +201,7 @@ def _sum_up_recording(
 
 
 def _describe_damage(stats: Counters) -> str:
-    """Format the counters of lost and damaged input.
-
-    The counters of frames and received bytes are omitted, because they may include data that is
-    not in the file.
-    """
+    """Format the counters of lost and damaged input."""
     counters = stats.to_dict()
     for name in ("frames", "bytes_in", "pending"):
         del counters[name]
@@ -347,10 +340,7 @@ def _make_file(
 
 
 def _announce(file: str, target: str, sensor: Sensor | None, *, as_json: bool) -> None:
-    """Print the destination and the next command.
-
-    With `as_json`, the destination is not printed, because standard output is for JSON.
-    """
+    """Print the destination, unless the output is JSON, and the next command."""
     if not as_json:
         say(target)
     if not target.startswith("udp:"):

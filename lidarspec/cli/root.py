@@ -1,7 +1,7 @@
 """The verbs, their shared options, and the entry point `main`.
 
-The module of a verb is imported when the verb is used. A failure is reported as one message and an
-exit code. This module imports neither NumPy nor construct, so that ``lidarspec --help`` is fast.
+The module of a verb is imported when the verb is used. This module imports neither NumPy nor
+construct, so that ``lidarspec --help`` is fast.
 """
 
 from __future__ import annotations
@@ -139,15 +139,12 @@ COMMON_OPTIONS = (
 
 @functools.cache
 def find_added_verbs() -> dict[str, EntryPoint]:
-    """Return the verbs of installed plugins, without loading the plugins.
-
-    A plugin cannot replace a verb of lidarspec.
-    """
+    """Return the verbs of installed plugins, without loading the plugins."""
     return {entry.name: entry for entry in entry_points(PLUGGED) if entry.name not in VERBS}
 
 
 class Verbs(click.Group):
-    """The group of all verbs. The module of a verb is imported when the verb is used."""
+    """The group of all verbs; the module of a verb is imported when the verb is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return [*VERBS, *find_added_verbs()]

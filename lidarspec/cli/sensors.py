@@ -1,8 +1,4 @@
-"""`sensors`, `show`, `plugins` and `trust`: the installed sensors and plugins.
-
-The modules that only some of these verbs need are imported inside functions, so that `sensors` and
-`show` start fast.
-"""
+"""`sensors`, `show`, `plugins` and `trust`: the installed sensors and plugins."""
 
 from __future__ import annotations
 
@@ -32,11 +28,7 @@ PLANNED_PACKETS = 32
 
 
 def list_sensors() -> tuple[list[KnownSensor], list[Plugin]]:
-    """Return facts about each installed sensor, and the plugins that failed to load.
-
-    Most plugins are not loaded for this, because the facts about their sensors are stored in a
-    table.
-    """
+    """Return facts about each installed sensor, and the plugins that failed to load."""
     # If the plugins are loaded, the program may have registered sensors of its own.
     is_fresh = "lidarspec.plugins" not in sys.modules
     rows = list_described_sensors() if is_fresh else None
@@ -330,7 +322,6 @@ def _build_commands(sensor: Sensor, sensor_id: str) -> dict[str, bytes]:
     Prints a remark for each command that cannot be built.
 
     Args:
-        sensor: the sensor.
         sensor_id: the sensor as the user named it, for the remark.
     """
     built = dict[str, bytes]()

@@ -216,7 +216,7 @@ def _serve(
     Args:
         target: "pty" or a URL.
         link: the path of a symbolic link to the pty; None for no link.
-        duration: time in seconds after which the sensor stops; None if it does not stop by itself.
+        duration: time in seconds after which the sensor stops; None for no limit.
         as_json: whether the address is printed as JSON.
 
     Raises:

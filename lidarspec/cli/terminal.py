@@ -1,8 +1,8 @@
 """Print to standard output and standard error.
 
-Addresses, file names and texts from devices and plugins are not trusted. Characters in them that
-control a terminal are escaped. If a remark cannot be printed, the verb continues, so that a
-recording is not lost. If data cannot be printed, an error is raised.
+Addresses, file names and texts from devices and plugins are not trusted. Characters in these texts
+that control a terminal are escaped. An error is raised if data cannot be printed. A verb continues
+if a remark cannot be printed, so that a recording is not lost.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ class Verbosity:
     """How many remarks are printed on standard error.
 
     Attributes:
-        loudness: -1 to print no remarks, 0 to print the usual remarks, and 1 to print more remarks.
-            It is set to 0 at the start of each command.
+        loudness: -1 to print no remarks, 0 to print the usual remarks, 1 to print more remarks.
     """
 
     loudness = 0
@@ -60,10 +59,7 @@ def say(content: str | bytes, *, nl: bool = True, colour: bool | None = None) ->
 
 
 def note(text: str) -> None:
-    """Print a remark on standard error, unless remarks are switched off.
-
-    If standard error is closed, nothing is printed.
-    """
+    """Print a remark on standard error, unless remarks are switched off."""
     if verbosity.loudness < 0:
         return
     try:
@@ -75,8 +71,6 @@ def note(text: str) -> None:
 @contextlib.contextmanager
 def prepare_streams() -> Iterator[None]:
     """Prepare standard input, output and error for a verb, and flush them at its end.
-
-    Closed streams are replaced by the null device. Each warning is printed once, as a remark.
 
     Raises:
         BrokenPipeError: if the reader has closed the pipe.

@@ -230,10 +230,7 @@ def _show_in_rerun(
     duration: float | None,
     selection: Selection,
 ) -> None:
-    """Show scans in Rerun's viewer, or write a file for it.
-
-    Returns at the end of the input, or after the duration.
-    """
+    """Show scans in Rerun's viewer, or write a file for it."""
     from lidarspec.formats.rerun import RERUN  # imports all formats, which takes a moment
     from lidarspec.view.rerun import SCHEMES, show
 
