@@ -1,18 +1,17 @@
 """Faults of a simulated sensor's clock.
 
 `ClockFaults` describes the faults; a user can give them as text, ``drift=50ppm,step=0.2s@10s``. A
-`ClockTimeline` applies the faults to the readings of a clock, from power-on to power-off. These
-texts are supported:
+`ClockTimeline` applies the faults to the readings of a clock. These texts are supported:
 
 | text | fault |
 |---|---|
 | `utc`, `tai`, `gps` | the clock follows the time of the computer in this time scale |
-| `drift=50ppm` | it is fast by 50 millionths of the time since power-on |
-| `step=0.2s@10s` | it jumps forward by 0.2 s, 10 s after power-on, or back if it is negative |
-| `pps@10s` | it counts a pulse twice, and is then one second ahead |
-| `leap@10s` | it repeats a second, as UTC does in a leap second |
-| `unlock=5s@10s` | its status is "not locked" for 5 s, or for ever if no duration is given |
-| `restart@10s` | it starts again as after power-on, without a date and not locked |
+| `drift=50ppm` | the clock is fast by 50 millionths of the time since power-on |
+| `step=0.2s@10s` | the clock jumps forward by 0.2 s, 10 s after power-on; if negative, back |
+| `pps@10s` | the clock counts a pulse twice, and is one second ahead afterwards |
+| `leap@10s` | the clock repeats a second, as UTC does in a leap second |
+| `unlock=5s@10s` | the status is "not locked" for 5 s, or for ever if no duration is given |
+| `restart@10s` | the clock starts again as after power-on, without a date and not locked |
 """
 
 from __future__ import annotations
@@ -50,8 +49,7 @@ class ClockFaults:
         drift_ppm: how much too fast the clock runs, in millionths; negative if it runs too slow.
         steps: (time, size) of each jump forward, in seconds; negative sizes are jumps back.
         unlocked: (start, end) of each time range in which the clock is not locked.
-        restarts: the times at which the clock starts again as after power-on. After a restart, it
-            does not follow a time scale and is not locked.
+        restarts: the times at which the clock starts again as after power-on.
 
     Raises:
         UsageError: for an unknown time scale, or a drift of more than 2 %.

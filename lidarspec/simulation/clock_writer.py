@@ -1,19 +1,13 @@
 """Write the time and the status of a clock into simulated frames.
 
-A clock is a field, a sum of fields, or a function of fields. To find the fields that a function
-depends on, each field is increased by one twice. If the time increases by the same step both times,
-the field is linear, for example the microseconds or the hour. If both steps are 28 to 31 days, the
-field is the month. If both steps are 365 or 366 days, the field is the year.
+A clock is a field, a sum of fields, or a function of fields. The fields of a function are found by
+changing each field and comparing the time. A date is written into the fields of the date, and the
+time of day into the other fields.
 
-To write a time, the date is written into the fields of the date. The time of day is distributed
-over the linear fields, from the coarsest to the finest.
+If the clock is a single field, the other fields with the same unit, scale and size are changed by
+the same difference, because these fields have times of the same clock.
 
-If the clock is a single field, the difference between the new and the old time is added to this
-field, in every element of its array and in every part of its frame. The same difference is added to
-all other fields of the same unit, scale and size. These fields have times of the same clock, such
-as the start and the end of a measurement.
-
-A clock is not supported if a frame does not give the time that was written into it.
+A clock is not supported if a frame does not give the time that was written into the frame.
 """
 
 from __future__ import annotations
@@ -66,7 +60,6 @@ class _TimeField:
     """A field of a clock.
 
     Attributes:
-        path: path of the field.
         step_ns: ns per step of the raw value; may be a fraction.
     """
 
@@ -84,14 +77,11 @@ class _StatusChoice:
 
 @dataclass(frozen=True)
 class _DateFields:
-    """The fields of a date.
+    """The paths of the fields of a date.
 
     Attributes:
-        year: path of the field with the year.
-        month: path of the field with the month.
-        day: path of the field with the day.
         date: an example date.
-        raw: raw values of the year, the month and the day of this date.
+        raw: raw values of the year, the month and the day of the example date.
     """
 
     year: str
@@ -105,9 +95,8 @@ class ClockWriter:
     """Writes readings into the fields of the clock in one frame type.
 
     Args:
-        sensor: the sensor.
-        clock: the clock of these frames.
-        table: simulated frames. The fields of the clock are found by changing a copy of the first.
+        table: simulated frames; a copy of the first frame is changed to find the fields of the
+            clock.
 
     Attributes:
         resolution_ns: the smallest step of the clock, ns.
@@ -138,10 +127,7 @@ class ClockWriter:
 
     @property
     def can_follow_dates(self) -> bool:
-        """Whether a date determines the reading of the clock.
-
-        This is the case if the clock never wraps, or wraps after a day or a whole fraction of it.
-        """
+        """Whether a date determines the reading of the clock."""
         return not self.period_ns or DAY_NS % self.period_ns == 0
 
     def read(self, table: CompiledTable) -> Times:
@@ -150,9 +136,6 @@ class ClockWriter:
 
     def find_power_on_reading(self, frame: CompiledTable) -> int:
         """Return the reading with which an unsynchronized clock starts at power-on, ns.
-
-        A clock with a year, a month and a day starts at 2000-01-01. Every other clock starts at its
-        lowest reading.
 
         Args:
             frame: a table of one frame; the fields of its clock are overwritten.
@@ -299,8 +282,6 @@ class FrameClock:
     """The clock of one frame type, to which a timeline can be applied.
 
     Args:
-        sensor: the sensor.
-        frame: the frame type.
         table: frames of this type; the first has the number 0.
 
     Attributes:
@@ -353,10 +334,7 @@ class FrameClock:
         return StatusWriter(replace(self._sensor, clock=clock), self._first, read)
 
     def check(self, faults: ClockFaults) -> None:
-        """Raise UsageError if faults of the clock cannot be written into these frames.
-
-        `check_status` checks faults of the clock's status.
-        """
+        """Raise UsageError if faults of the clock cannot be written into the frames."""
         if self._writer is None:
             raise UsageError(
                 f"{self._sensor.id} has no clock in {self._frame!r} frames, so clock faults"
@@ -377,8 +355,6 @@ class FrameClock:
         """Apply the faults of a timeline to the clock of frames.
 
         Args:
-            table: the frames.
-            timeline: the faults.
             times: the time of each frame since power-on, (n,) ns.
         """
         if timeline.is_perfect:
@@ -399,10 +375,7 @@ class FrameClock:
     def _write_dates(self, table: CompiledTable, readings: Times) -> None:
         """Write dates into fields that do not belong to the clock.
 
-        Frames after a restart have no date, and keep their values.
-
         Args:
-            table: the frames.
             readings: the dates, (n,) ns since 1970.
         """
         date = self._sensor.frames[self._frame].simulation.date
@@ -422,10 +395,7 @@ class FrameClock:
 
 
 def _find_written_clock(sensor: Sensor, frame: str) -> Clock | None:
-    """Return the clock to write into frames of a type; None if they have no clock.
-
-    Frames that report the date for the sensor's clock also contain this clock.
-    """
+    """Return the clock to write into frames of a type; None if they have no clock."""
     clock = find_clock(sensor, frame)
     shared = sensor.clock
     if clock is not None or shared is None:
@@ -458,9 +428,7 @@ class StatusWriter:
     Args:
         sensor: the sensor; its clock declares a status.
         table: frames of the type that has the status.
-        read: returns the readings of the clock in frames, (n,) ns; None if they have no clock. A
-            status that changes the reading is not used, because it changes the format of the
-            clock's fields.
+        read: returns the readings of the clock in frames, (n,) ns; None if they have no clock.
 
     Raises:
         UsageError: if no values of the fields give a locked and an unlocked status.
@@ -501,10 +469,8 @@ class StatusWriter:
         """Write the status of the clock into frames.
 
         Args:
-            table: the frames.
             states: LOCKED, LOST or RESTARTED for each frame, (n,).
-            follows: the time scale that the clock follows. A locked clock gets a status with this
-                epoch, if there is one.
+            follows: the time scale that the clock follows.
         """
         raw = np.array(self.choose(follows))[states]
         for path, column in zip(self._paths, raw.T, strict=True):
@@ -513,12 +479,7 @@ class StatusWriter:
             write_raw(table, path, np.broadcast_to(shaped, (len(states), *axes)))
 
     def choose(self, follows: str) -> tuple[tuple[int, ...], ...]:
-        """Return the raw values of the status fields: locked, lost and restarted.
-
-        If possible, the status of a locked clock has the epoch `follows`, the status of a lost
-        clock has the epoch of the locked clock, and the status of a restarted clock has the epoch
-        "boot".
-        """
+        """Return the raw values of the status fields: locked, lost and restarted."""
 
         def rank(choice: _StatusChoice, epoch: str, raw: tuple[int, ...]) -> tuple[Any, ...]:
             # The field with the mode comes before the field with its status, which is changed

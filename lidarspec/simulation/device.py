@@ -1,10 +1,9 @@
 """A simulated sensor as a device: it takes bytes and returns bytes, without I/O.
 
-All behaviour follows from the spec. Data frames are sent at the rate of the sensor's clock, and
-other frames at their declared rate. Commands get the documented replies (`ReplyMaker`), and can
-start and stop the data. If no command of `on_open` starts the sensor, it sends data from power-on.
-The caller passes the current time to each method, in ns of one monotonic clock, so the device can
-run faster than real time.
+Data frames are sent at the rate of the sensor's clock, and other frames at their declared rate.
+Commands get the documented replies, and can start and stop the data. If no command of `on_open`
+starts the sensor, it sends data from power-on. The caller passes the current time to each method,
+in ns of one monotonic clock, so the device can run faster than real time.
 """
 
 from __future__ import annotations
@@ -64,8 +63,8 @@ REQUEST_TIMEOUT_NS = 50_000_000
 class ReceivedCommand:
     """A received command, with the raw values in its frame by field path.
 
-    The values include the texts that match placeholders of the command. The key of such a text is
-    the name of the placeholder in braces, for example "{handle}".
+    A text that matches a placeholder of the command is a value as well; the key is the placeholder,
+    for example "{handle}".
     """
 
     name: str
@@ -141,7 +140,6 @@ class ReplyMaker:
     """Makes the replies of one sensor to its commands.
 
     Args:
-        sensor: the sensor.
         shake: standard deviation of the noise on IMU measurements, m/s2 and rad/s.
 
     Attributes:
@@ -157,10 +155,7 @@ class ReplyMaker:
         self._decoders = {link: _make_command_decoder(sensor, link) for link in links}
 
     def find_requests(self, data: bytes, now: int, link: str) -> list[ReceivedCommand]:
-        """Return the commands that the received bytes complete.
-
-        Bytes that are not part of a command are ignored.
-        """
+        """Return the commands that the received bytes complete."""
         decoder = self._decoders.get(link)
         if decoder is None:
             return []
@@ -203,10 +198,7 @@ class ReplyMaker:
         return ReplyPart(name, self._frames.make(name, given, now))
 
     def _find_reply_values(self, name: str, request: ReceivedCommand) -> dict[str, Any]:
-        """Return a reply's fixed values, and the values that it repeats from its request.
-
-        The values are physical.
-        """
+        """Return a reply's fixed values, and the values that it repeats from its request."""
         fields = get_codec(self._sensor.frames[name]).schema.fields
         raw = {
             path: request.values[path] for path in request.command.echoes if path in request.values
@@ -216,10 +208,7 @@ class ReplyMaker:
         }
 
     def _find_request(self, frame: str, data: bytes, link: str) -> ReceivedCommand | None:
-        """Return the command that a received frame contains; None if there is none.
-
-        If several commands match, the command with the most fixed values is returned.
-        """
+        """Return the command that a received frame contains; None if there is none."""
         values = dict(_iter_flat(parse(self._sensor, data, frame=frame)))
         fields = get_codec(self._sensor.frames[frame]).schema.fields
         best: ReceivedCommand | None = None
@@ -237,11 +226,7 @@ class ReplyMaker:
 def _match_command(
     command: Command, values: Mapping[str, Any], fields: Mapping[str, FieldInfo]
 ) -> dict[str, str] | None:
-    """Return the texts in a frame that match the placeholders of a command.
-
-    The keys are the names of the placeholders in braces, for example "{handle}". Returns None if
-    the values of the frame do not match the command.
-    """
+    """Return the texts for the placeholders of a command, or None without a match."""
     fixed = {
         path: find_code(fields[path], value) if path in fields else value
         for path, value in command.fixed.items()
@@ -275,18 +260,12 @@ def _make_command_decoder(sensor: Sensor, link: str) -> Decoder:
 
 @functools.lru_cache(maxsize=256)
 def _make_incoming(frame: Frame) -> Frame:
-    """Return an outgoing frame type as an incoming type, to parse commands.
-
-    The result is cached, so that its layout is computed only once.
-    """
+    """Return an outgoing frame type as an incoming type, to parse commands."""
     return replace(frame, direction="in")
 
 
 def _to_physical(info: FieldInfo, value: Any) -> Any:
-    """Return a parsed value in the unit of its field.
-
-    Bytes are unchanged, a label becomes its number, and each element of an array is converted.
-    """
+    """Return a parsed value in the unit of its field."""
     if isinstance(value, bytes) or (isinstance(value, list) and info.kind == "bytes"):
         return value
     if isinstance(value, list | tuple):
@@ -303,16 +282,15 @@ def _iter_flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[st
 
 
 class _PlannedData(NamedTuple):
-    """Data to send at a planned time. The plan is sorted by `at`, then by `number`.
+    """Data to send at a planned time.
 
     Attributes:
         at: the time, ns since power-on.
         number: a running number in the order of planning.
         link: name of the link to send the data over.
         frame: the frame type; "" for bytes that are not a frame.
-        data: the bytes.
-        repetition: for a frame that is sent periodically, the number of earlier frames of its type;
-            None for all other data.
+        repetition: number of earlier frames of a type that is sent periodically; None for all other
+            data.
     """
 
     at: float
@@ -325,9 +303,6 @@ class _PlannedData(NamedTuple):
 
 class _FrameStream:
     """The data frames of one type that a device sends after it was started.
-
-    Args:
-        timeline: the faults of the sensor's clock.
 
     Attributes:
         due: the time of the next frame, ns since power-on.
@@ -409,13 +384,13 @@ class SimulatedDevice:
     Attributes:
         present: whether the device is connected.
         commands_received: the names of the commands that the device has received.
-        destination: (address, port) to which a command has redirected the data; None if no command
-            has. The address is "" if the command contained only a port.
+        destination: (address, port) to which a command has redirected the data, or None. The
+            address is "" if the command contained only a port.
         sent: number of sent frames by type, before faults.
         lines: the links with their faults, by name.
-        utc_offset_ns: UTC minus the time that the caller passes, ns, so that a synchronized clock
-            shows the current date. If None, the clock shows the dates of the spec's `sweep`. A
-            change takes effect at the next `start`.
+        utc_offset_ns: UTC minus the time that the caller passes, ns, for the date of a synchronized
+            clock; None to use the dates of the spec's `sweep`. A change takes effect at the next
+            `start`.
 
     Raises:
         UsageError: if the sensor declares no `sweep`, or if its clock cannot have the faults.
@@ -463,13 +438,10 @@ class SimulatedDevice:
         check_clock_faults(sensor, self.faults.clock)
 
     def _make_link(self, name: str, seed: int) -> FaultyLink:
-        """Return the link of this name with its faults.
-
-        TCP and HTTP lose no bytes, so these links have no faults. A byte stream other than the data
-        link is treated as TCP.
-        """
+        """Return the link of this name with its faults."""
         link = self.sensor.links[name]
         stream = not is_datagram(link)
+        # A byte stream other than the data link is treated as TCP, which loses no bytes.
         is_reliable = isinstance(link, Http) or (stream and name != "data")
         return FaultyLink(Faults() if is_reliable else self.faults, seed=seed, stream=stream)
 
@@ -506,11 +478,8 @@ class SimulatedDevice:
         return ClockTimeline(faults, now + self.utc_offset_ns)
 
     def _waits_for_command(self) -> bool:
-        """Return whether the device sends no data until a start command is received.
-
-        Only start commands in `on_open` are considered, because programs send no other start
-        command.
-        """
+        """Return whether the device sends no data until a start command is received."""
+        # Programs send no other start commands.
         opening = [self.sensor.commands[name] for name in self.sensor.on_open]
         return any(command.starts and command.frame for command in opening)
 
@@ -527,8 +496,7 @@ class SimulatedDevice:
         """Make the sensor's clock jump; the jump happens within a quarter of a second.
 
         Args:
-            seconds: the size of the jump; negative to jump back. Several jumps add up until the
-                next `start`.
+            seconds: the size of the jump; negative to jump back. Several jumps add up.
 
         Raises:
             UsageError: if the sensor has no clock, if its clock cannot be written, or if no data is
@@ -613,10 +581,7 @@ class SimulatedDevice:
         return self._powered + math.ceil(max(times) / self.rate)
 
     def _find_device_time(self, now: int) -> float:
-        """Return the time of the device, ns since power-on.
-
-        With an infinite rate, it advances when data is requested.
-        """
+        """Return the time of the device, ns since power-on."""
         if math.isinf(self.rate):
             return self._time
         late = int((now - self._powered) - self._time / self.rate) - MAX_DELAY_NS
@@ -652,10 +617,7 @@ class SimulatedDevice:
         self._plan_data(due.at + period_ns, due.link, due.frame, data, repetition)
 
     def _reply(self, request: ReceivedCommand, now: float) -> None:
-        """Plan the reply to a command, and the data if the command starts it.
-
-        While data is sent, a command with `only_stopped` is ignored.
-        """
+        """Plan the reply to a command, and the data if the command starts it."""
         self.commands_received.append(request.name)
         command = request.command
         time_ns = now
@@ -695,10 +657,7 @@ class SimulatedDevice:
                 self._begin_data(time_ns, chosen)
 
     def _apply_effect(self, command: str) -> None:
-        """Change the sweep as the spec declares it for a command.
-
-        Frames that were made before are sent unchanged.
-        """
+        """Change the sweep as the spec declares it for a command."""
         sweep = self._sweep or self.sensor.simulation.sweep
         if sweep is None:
             return

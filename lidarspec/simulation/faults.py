@@ -1,8 +1,7 @@
 """Inject faults into the data of a simulated sensor.
 
 The faults are corrupt bytes, lost and reordered packets, disconnections, a blocked rotor, IMU noise
-and faults of the clock. The seed and the packets determine the faults. The sizes of the batches do
-not matter.
+and faults of the clock. The seed and the packets determine the faults.
 """
 
 from __future__ import annotations
@@ -29,11 +28,10 @@ class Faults:
     """The faults of a simulated sensor.
 
     Args:
-        errors: fraction of bytes to corrupt, 0 to 1. One bit of the byte is flipped. In a byte
-            stream, the byte may be dropped instead, or a random byte inserted after it.
+        errors: fraction of bytes to corrupt, 0 to 1. In a byte stream, bytes may also be dropped or
+            inserted.
         loss: fraction of packets to drop, 0 to 1.
-        reorder: maximum delay of a datagram, in packets; 0 for no delay. One datagram in ten is
-            delayed.
+        reorder: maximum delay of a datagram, in packets; 0 for no delay.
         unplug: time before each disconnection, in seconds; 0 for no disconnection.
         absent: duration of each disconnection, in seconds.
         shake: standard deviation of the noise on IMU measurements, in m/s2 and rad/s; 0 for no
@@ -104,8 +102,6 @@ class FaultyLink:
     """A link that corrupts, drops and reorders packets.
 
     Args:
-        faults: the faults.
-        seed: random seed.
         stream: whether the link is a byte stream, instead of datagrams.
 
     Attributes:
@@ -131,8 +127,7 @@ class FaultyLink:
     def transmit(self, packets: Sequence[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
         """Return the packets that arrive, as (frame type, bytes).
 
-        Delayed packets are returned by later calls. Packets that are still delayed after the last
-        call are lost.
+        Delayed packets are returned by later calls.
         """
         self.sent += len(packets)
         if not (self._faults.errors or self._faults.loss or self._faults.reorder):

@@ -1,7 +1,4 @@
-"""Split messages into datagrams, as `lidarspec.spec.links.Assembled` declares.
-
-`lidarspec.framing.datagram_assembly` does the reverse.
-"""
+"""Split messages into datagrams, as `lidarspec.spec.links.Assembled` declares."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Make frames from the physical values of some fields.
 
 A `sweep` returns such values. Constants and checksums are filled in; all other fields are 0. Unlike
-`build`, `FrameMaker` makes many frames at once. The values of header fields, such as counts,
-determine the layout of a frame, as they do in a decoder.
+`build`, `FrameMaker` makes many frames at once.
 """
 
 from __future__ import annotations
@@ -74,7 +73,7 @@ class FrameMaker:
             sensor: id of the sensor, for messages.
             root: the node of the parts.
             limit: maximum length of a frame, in bytes.
-            given: raw values of those fields of the frame on which the parts depend.
+            given: raw values of the fields of the frame on which the parts depend.
         """
         maker = cls.__new__(cls)
         maker._coder = None  # only whole frames have a wire form
@@ -110,10 +109,10 @@ class FrameMaker:
         self._makers: dict[tuple[Any, ...], FrameMaker] = {}
 
     def table(self, frames: Sequence[Values]) -> CompiledTable:
-        """Return a table with one frame for each mapping of field paths to values.
+        """Return a table with one frame for each mapping of paths to physical values.
 
-        Values are physical. The value of an enum may be its name, an array of bytes may be bytes,
-        and a part is a mapping of field paths to values.
+        The value of an enum may be its name, and an array of bytes may be bytes. A part is a
+        mapping of field paths to values.
 
         Raises:
             SpecError: if a value is given for a field that the frame does not have.
@@ -203,11 +202,7 @@ class FrameMaker:
         return counted
 
     def _with_parts(self, values: Values) -> tuple[Values, dict[str, bytes]]:
-        """Return the values of a frame without its parts, and the bytes of the parts.
-
-        The values include the sizes and counts of the parts. The second dict has the bytes of each
-        array of parts, by its path.
-        """
+        """Return the values of a frame without parts, and the bytes of parts by path."""
         result = dict(values)
         parts_by_axis = dict[str, bytes]()
         for axis, node in self.schema.parts.items():
@@ -244,10 +239,7 @@ class FrameMaker:
     def _fill_in(
         self, formula: Formula | None, values: dict[str, Any], number: int, axis: str
     ) -> None:
-        """Set the first field of a formula so that the formula gives `number`.
-
-        Nothing is changed if this field has a value already.
-        """
+        """Set the first field of a formula so that the formula gives `number`."""
         if formula is None:
             paths = []
         else:

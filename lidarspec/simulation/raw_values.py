@@ -23,12 +23,7 @@ def round_raw(info: FieldInfo, raw: Floats) -> Floats:
 
 
 class PartRows(CompiledTable):
-    """The parts of frames, as a table; `put_back` writes them into the frames.
-
-    Args:
-        frames: the frames.
-        path: path of the parts.
-    """
+    """The parts of frames, as a table; `put_back` writes them into the frames."""
 
     def __init__(self, frames: CompiledTable, path: str) -> None:
         parts = frames.schema.split_part_path(path)
@@ -65,8 +60,6 @@ def write_raw(table: CompiledTable, path: str, values: NDArray[Any]) -> None:
     """Write raw values into every frame that has the field.
 
     Args:
-        table: the frames.
-        path: path of the field.
         values: the values, (n, ...), or one value for all frames.
     """
     for group in table.groups:

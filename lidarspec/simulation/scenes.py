@@ -59,10 +59,7 @@ class Scene(Protocol):
 
 @dataclass(frozen=True)
 class Box:
-    """An upright box, given by its lowest and its highest corner.
-
-    The corners are in metres, in the sensor's axes.
-    """
+    """An upright box: its lowest and highest corner in the sensor's axes, in metres."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
@@ -83,8 +80,7 @@ class Mover:
 
     Args:
         size: size of the box in x, y and z, metres.
-        path: (x, y) of at least two points, metres. The centre of the box moves between them in
-            straight lines.
+        path: (x, y) of at least two points, metres; the centre of the box moves along this path.
         speed: speed, metres per second.
         floor: z of the underside of the box, metres.
     """
@@ -121,8 +117,6 @@ class Mover:
 @dataclass(frozen=True)
 class Room:
     """A room around the sensor, with fixed and moving boxes.
-
-    The default room has no symmetry, so that a mirrored point cloud can be recognised.
 
     Args:
         walls: the box that the walls, the floor and the ceiling form; None for no walls.
@@ -205,10 +199,7 @@ def _may_hit(body: Box | Mover, low: Vector, high: Vector, beams: Vector, origin
 
 
 def make_room(seed: int = 0) -> Room:
-    """Return a random room with boxes and a walking person.
-
-    The same seed always gives the same room.
-    """
+    """Return a random room with boxes and a walking person."""
     walker = Mover((0.4, 0.5, 1.7), ((1.4, -1.5), (0.8, 1.9), (-1.8, 1.2)))
     if seed == 0:
         return Room(movers=(walker,))
@@ -241,7 +232,6 @@ def parse_scene(table: Mapping[str, Any], place: str = "scene") -> Room:
     """Return the scene that a TOML table describes; see the module's docstring.
 
     Args:
-        table: the table.
         place: name of the table, for error messages.
 
     Raises:

@@ -1,26 +1,16 @@
 """Make the frames that a sensor would send in a scene, and calculate their times.
 
-A block of packets is made in four steps:
+Packets are made in four steps:
 
 1. The sensor's `sweep` gives the values that are not measured, such as angles, counters and time.
-   The packets are filled with these values.
-2. The sensor's `points` gives the directions of the beams.
-3. The scene gives the range of each beam.
-4. The ranges are converted with the scale of the range fields, and written into these fields
-   (`Measurement`).
+2. The sensor's `points` gives the directions of the beams. 3. The scene gives the range of each
+beam. 4. `Measurement` writes the ranges into the range fields. `PointPlacement` writes the
+coordinates of Cartesian points.
 
-The last step does not need an inverse of `points`. To find the points that depend on a field, each
-field in metres is set to a probe value. If directions depend on ranges, steps 2 to 4 are repeated;
-a beam whose direction keeps changing gets no return. If the sensor declares a function `encode`,
-this function gets the measured points and returns the values of the fields instead.
+To find the points that depend on a field, each field in metres is set to a probe value. If the
+sensor declares a function `encode`, this function returns the values of the fields instead.
 
-The directions of beams cannot be calculated from Cartesian points, so the spec declares the
-directions. The coordinates are linear functions of the raw values of fields. The resulting
-equations are solved for the point that a beam hits (`PointPlacement`).
-
-The time of each packet is calculated from the first of the following that the spec declares: the
-packet rate; the sensor's clock, which `sweep` sets; the times of the points in a packet; the baud
-rate of the serial line.
+The time of each packet is calculated by `PacketTimes`.
 """
 
 from __future__ import annotations
@@ -93,10 +83,8 @@ class RangeField:
 
     Attributes:
         path: path of the field.
-        inner: an index into the axes that the points have in addition to the axes of the field. The
-            field determines the points with this index.
-        step: metres per raw step; None if it differs between packets, for example because of a
-            value in the header or a calibration.
+        inner: an index into the axes that the points have in addition to the axes of the field.
+        step: metres per raw step; None if it differs between packets.
         zero: range of the raw value 0, metres.
     """
 
@@ -108,9 +96,7 @@ class RangeField:
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """The beams of n packets.
-
-    The first axis of each array is the packet. The arrays broadcast against each other.
+    """The beams of n packets; the first axis of each array is the packet.
 
     Attributes:
         range: as in `Polar`.
@@ -143,11 +129,8 @@ class Measurement:
     """Writes measured ranges into frames of one type of a sensor.
 
     Args:
-        sensor: the sensor.
-        frame: the frame type.
         table: example frames, in which the fields with ranges are searched.
-        given: paths of the fields that `sweep` gives. Of these fields, only ranges are
-            changed.
+        given: paths of the fields that `sweep` gives; they are changed only if they are ranges.
 
     Raises:
         SpecError: if no fields that determine the ranges are found, and the sensor has no `encode`.
@@ -187,13 +170,14 @@ class Measurement:
             table: the frames, or the parts of frames.
             numbers: number of each packet in the sweep; for parts, the number of the packet that
                 contains the part.
-            scene: the scene.
             times: time of each packet, (n,) seconds since the scene began.
         """
         steps = [self._measure_step(table, target) for target in self._targets]
         before = np.zeros(1)
         blind = np.zeros(1, np.bool_)
         written: dict[str, NDArray[Any]] = {}
+        # If directions depend on ranges, the beams are measured again with the new directions.
+        # A beam whose direction keeps changing gets no return.
         for attempt in range(MAX_ROUNDS):
             beams = self.beams(table)
             ranges = self._measure(beams, scene, times)
@@ -253,10 +237,7 @@ class Measurement:
         )
 
     def _measure(self, beams: Beams, scene: Scene, times: Floats) -> Floats:
-        """Return the range of each beam in metres.
-
-        It is 0 for a range outside the sensor's limits, and for an unknown direction.
-        """
+        """Return the range of each beam in metres; 0 if it cannot be measured."""
         has_direction = np.isfinite(beams.azimuth) & np.isfinite(beams.elevation)
         seconds = times.reshape(-1, *(1,) * (beams.range.ndim - 1)) + beams.time
         metres = scene.measure(
@@ -332,11 +313,7 @@ class Measurement:
         return tuple(targets)
 
     def _find_linear_fields(self, table: CompiledTable) -> list[RangeField]:
-        """Return the fields that `points` converts to ranges by a linear function.
-
-        Candidates are fields in metres, and integers without a unit in arrays. If a field has no
-        unit, the ranges must be proportional to its raw values.
-        """
+        """Return the fields that `points` converts to ranges by a linear function."""
         targets = []
         for path, info in table.schema.fields.items():
             metres = factor(info.unit, "m") is not None
@@ -356,15 +333,7 @@ class Measurement:
         return targets
 
     def _probe(self, table: CompiledTable, paths: Iterable[str], *probes: int) -> list[Beams]:
-        """Set fields to each of several values, and return the beams for each value.
-
-        The fields are restored at the end.
-
-        Args:
-            table: the frames.
-            paths: paths of the fields.
-            probes: the raw values.
-        """
+        """Set fields to each of several raw values, and return the beams for each value."""
         before = {path: table.raw(path) for path in paths}
         beams = []
         for probe in probes:
@@ -376,10 +345,7 @@ class Measurement:
         return beams
 
     def _measure_step(self, table: CompiledTable, target: RangeField) -> tuple[Any, Any]:
-        """Return metres per raw step, and the range of the raw value 0 in metres.
-
-        Both are numbers, or arrays with a value for each point.
-        """
+        """Return metres per raw step, and the range of the raw value 0 in metres."""
         if target.step is not None:
             return target.step, target.zero
         once, twice = (
@@ -392,7 +358,6 @@ class Measurement:
         """Return all possible values of `RangeField.inner`.
 
         Args:
-            table: the frames.
             answer: the ranges of the points, (n, ...).
         """
         extra = answer.ndim - 1 - table.schema.depth()
@@ -434,10 +399,7 @@ class PointPlacement(Measurement):
     def _get_directions(
         self, numbers: Sequence[int], shape: tuple[int, ...]
     ) -> tuple[Floats, Floats]:
-        """Return the declared azimuths and elevations of packets, (n, *shape) each.
-
-        Packets with fewer points are padded with nan.
-        """
+        """Return the declared azimuths and elevations of packets, (n, *shape) each."""
         declared = self._sensor.simulation_of(self._frame).directions
         if declared is None:
             reason = "a sensor with Cartesian points requires Simulation(directions=...)"
@@ -498,9 +460,6 @@ class PointPlacement(Measurement):
     def _probe_coordinates(self, table: CompiledTable, paths: Sequence[str]) -> list[Floats]:
         """Return the coordinates for several sets of field values.
 
-        In the first set, all fields are 0. In each other set, one field has a probe value and all
-        others are 0. The values are written into `table`, which is restored at the end.
-
         Returns:
             The x, y and z of the points for each set, (3, n, ...).
         """
@@ -513,10 +472,7 @@ class PointPlacement(Measurement):
         return [each.positions for each in beams if each.positions is not None]
 
     def _trace_targets(self, table: CompiledTable) -> tuple[RangeField, ...]:
-        """Return the fields that the coordinates depend on linearly.
-
-        The fields are in metres or have no unit.
-        """
+        """Return the fields that the coordinates depend on linearly."""
         targets = []
         for path, info in table.schema.fields.items():
             metres = not info.unit or factor(info.unit, "m") is not None
@@ -572,10 +528,7 @@ def _get_table_name(frame: str, table: CompiledTable) -> str:
 
 
 def _evaluate_points(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[Points, Batch]:
-    """Return the result of `points` for a table, and the batch of the table.
-
-    The frames of the table are treated as the first frames of a stream.
-    """
+    """Return the result of `points` for a table, and the batch of the table."""
     batch = _make_point_batch(sensor, table)
     points = sensor.points_of(_get_table_name(frame, table))
     with np.errstate(all="ignore"), plugin_errors(f"points of {frame}", sensor.id, points):
@@ -624,8 +577,6 @@ class RestingImu:
     """Writes the measurements of an IMU at rest into frames of one type.
 
     Args:
-        sensor: the sensor.
-        frame: the frame type.
         given: paths of the fields that `sweep` gives; they are not changed.
 
     Raises:
@@ -643,7 +594,6 @@ class RestingImu:
         """Write the measurements into frames.
 
         Args:
-            frames: the frames.
             shake: standard deviation of the noise, m/s2 and rad/s; 0 for no noise.
             seed: seed of the noise.
         """
@@ -701,10 +651,7 @@ class RestingImu:
         return paths
 
     def _probe(self, table: CompiledTable, path: str) -> Floats:
-        """Return the IMU measurements in a table whose field is set to `PROBE_VALUE`.
-
-        The field is 0 afterwards.
-        """
+        """Return the IMU measurements in a table whose field is set to `PROBE_VALUE`."""
         write_raw(table, path, np.array(PROBE_VALUE))
         readings = self._read_motion(table)
         write_raw(table, path, np.array(0))
@@ -735,8 +682,6 @@ class PacketTimes:
     """Calculates the times of a sensor's packets, one batch after another.
 
     Args:
-        sensor: the sensor.
-        frame: the frame type.
         table: the first packets.
         beams: the beams of these packets.
 
@@ -788,10 +733,7 @@ class PacketTimes:
 
 
 def _seconds_per_point(beams: Beams) -> float:
-    """Return the median time between consecutive points of a packet, in seconds.
-
-    Returns 0 if all points have the same time.
-    """
+    """Return the median time between consecutive points of a packet, in seconds."""
     times = np.broadcast_to(beams.time, beams.range.shape).reshape(len(beams.range), -1)
     steps: NDArray[Any] = np.diff(times, axis=1)
     if (steps > 0).any():
@@ -812,8 +754,8 @@ class PacketBlock:
 
     Attributes:
         frames: the bytes of each packet.
-        times: time of each packet since the first packet of the block, (n + 1,) int64 ns. The last
-            entry is the time of the packet after the block.
+        times: time of each packet, and of the packet after the block, since the first packet, (n +
+            1,) int64 ns.
     """
 
     frames: list[bytes]
@@ -824,10 +766,7 @@ class FrameSimulation:
     """Makes the packets of one data frame type of a sensor.
 
     Args:
-        sensor: the sensor.
-        frame: the frame type.
-        blocked: whether the rotor is blocked. If so, the angles and the field that ends scans are
-            the same in all frames.
+        blocked: whether the rotor is blocked, so that the angles are the same in all frames.
 
     Attributes:
         interval: mean time between packets, ns; 0 if the spec does not determine times.
@@ -892,11 +831,8 @@ class FrameSimulation:
         """Return `count` packets of the sweep, beginning with number `start`.
 
         Args:
-            start: number of the first packet.
-            count: number of packets.
             scene: the scene to measure.
-            since: time of the first packet, seconds since the scene began. With a timeline, this is
-                also the time since power-on.
+            since: time of the first packet, seconds since the scene began.
             shake: standard deviation of the noise on IMU measurements, m/s2 and rad/s.
             timeline: the faults of the sensor's clock; None for no faults.
         """
@@ -958,11 +894,7 @@ class FrameSimulation:
 class FramesWithoutPoints:
     """Makes frames without points: replies and periodic frames.
 
-    The values of a frame come from the defaults of the spec, the `sweep` of the frame type, and the
-    measurements of an IMU at rest.
-
     Args:
-        sensor: the sensor.
         shake: standard deviation of the noise on IMU measurements, m/s2 and rad/s.
     """
 
@@ -991,7 +923,6 @@ class FramesWithoutPoints:
         """Return a frame of a type.
 
         Args:
-            name: the frame type.
             values: physical values that replace the values that the spec declares.
             now: the time of the frame, ns since power-on.
         """
@@ -1001,10 +932,7 @@ class FramesWithoutPoints:
         return self._get_maker(name).seal(table)[0]
 
     def make_frame(self, name: str, number: int) -> bytes:
-        """Return frame number `number` of a type.
-
-        Frames are made in batches, because a batch takes hardly longer than a single frame.
-        """
+        """Return frame number `number` of a type."""
         start = number - number % PERIODIC_BATCH
         if self._batches.get(name, (-1, []))[0] != start:
             batch = self._make_batch(name, range(start, start + PERIODIC_BATCH))
@@ -1030,7 +958,6 @@ class FramesWithoutPoints:
         """Return frames with the values that the spec declares.
 
         Args:
-            name: the frame type.
             numbers: the numbers of the frames.
             values: physical values that replace declared values.
         """
@@ -1066,10 +993,7 @@ def _iter_due(name: str, rate: float) -> Iterator[tuple[float, str, int]]:
 
 @functools.lru_cache(maxsize=64)
 def frame_simulation(sensor: Sensor, frame: str, *, blocked: bool = False) -> FrameSimulation:
-    """Return the simulation of a data frame type.
-
-    The result is cached, because making it is slow.
-    """
+    """Return the cached simulation of a data frame type."""
     return FrameSimulation(sensor, frame, blocked=blocked)
 
 
@@ -1151,8 +1075,9 @@ def check_clock_faults(sensor: Sensor, faults: ClockFaults) -> None:
 def find_followed_scale(sensor: Sensor) -> str:
     """Return the time scale that the clock of a simulated sensor follows.
 
-    This is "utc", "tai" or "gps", or "" if the clock is not synchronized, or if no date can be
-    written into it.
+    Returns:
+        "utc", "tai" or "gps"; "" if the clock is not synchronized, or if no date can be written
+            into the clock.
     """
     others = FramesWithoutPoints(sensor)
     try:
@@ -1179,9 +1104,7 @@ def find_followed_scale(sensor: Sensor) -> str:
 
 
 def _find_main_clock(sensor: Sensor, others: FramesWithoutPoints) -> tuple[str, FrameClock] | None:
-    """Return the frame type with the sensor's clock, and the clock of its frames.
-
-    Returns None if the sensor sends no clock.
+    """Return the frame type with the sensor's clock, and its clock, or None.
 
     Raises:
         UsageError: if the clock of the data frame cannot be written.
