@@ -1,9 +1,8 @@
 """Pictures made of characters in cells, with braille characters for dots.
 
-A cell has 2 columns and 4 rows of dots. The dots are square if a cell is twice as high as wide.
-Each cell has a character and an ink. An ink is an index of `INKS`, so that two pictures can be
-compared cell by cell. It is shown in true colour, 256 colours, 16 colours or without colour,
-depending on the terminal.
+A cell has 2 columns and 4 rows of dots. Each cell has a character and an ink, which is an index of
+`INKS`. An ink is shown in true colour, 256 colours, 16 colours or without colour, depending on the
+terminal.
 """
 
 from __future__ import annotations
@@ -92,10 +91,7 @@ INKS: tuple[TextStyle, ...] = (*_FIXED, *_SCALE)
 
 @functools.cache
 def sgr(ink: int, depth: Depth) -> str:
-    """Return the escape sequence that selects an ink.
-
-    Without colours, only bold and faint text distinguish the inks.
-    """
+    """Return the escape sequence that selects an ink."""
     chosen = INKS[ink]
     parts = ["0"]
     if chosen.bold:
@@ -157,11 +153,10 @@ class CellGrid:
         self.inks[row, column : column + len(text)] = ink
 
     def paste(self, row: int, column: int, other: CellGrid) -> None:
-        """Copy another picture into this one.
+        """Copy another picture into this one, without the parts that would lie outside.
 
         Args:
             row, column: the cell for the upper left corner of the other picture.
-            other: the other picture. Parts that would lie outside this picture are omitted.
         """
         width = min(other.size[0], self.size[0] - column)
         height = min(other.size[1], self.size[1] - row)
@@ -206,11 +201,9 @@ class Canvas:
     Attributes:
         width: number of columns of cells.
         height: number of rows of cells.
-        ramp: the column that the colours show. For "range", a cell has the colour of its nearest
-            point. For other columns, it has the colour of the point with the highest value.
+        ramp: the column that the colours show.
         dots: the dots of points, (4 * height, 2 * width) bool.
-        lines: the dots of rings and axes, (4 * height, 2 * width) bool. They are shown only in
-            cells without points.
+        lines: the dots of rings and axes, (4 * height, 2 * width) bool.
         steps: the colour of each cell's points, as a step of the colour ramp, (height, width)
             int16; -1 for cells without points.
         labels: (row, column) of a cell -> its character and ink, for the cells of labels.
@@ -225,7 +218,7 @@ class Canvas:
         self.labels: dict[tuple[int, int], tuple[str, int]] = {}
 
     def plot(self, column: NDArray[Any], row: NDArray[Any], shade: NDArray[Any]) -> None:
-        """Set the dots of points. Points outside the canvas are ignored.
+        """Set the dots of points, without points outside the canvas.
 
         Args:
             column, row: fractional coordinates in dots, (n,).
@@ -238,7 +231,7 @@ class Canvas:
         self.steps[down[order] // DOTS_DOWN, across[order] // DOTS_ACROSS] = steps[order]
 
     def draw_line(self, column: NDArray[Any], row: NDArray[Any]) -> None:
-        """Set the dots of a ring or an axis. Points cover these dots.
+        """Set the dots of a ring or an axis, which points cover.
 
         Args:
             column, row: fractional coordinates in dots, (n,).
@@ -255,8 +248,7 @@ class Canvas:
             over: whether the text may hide points.
 
         Returns:
-            Whether the text was written. It is not written if it would leave the canvas, or hide
-            points or other text.
+            Whether the text was written.
         """
         cells = [(row, column + index) for index in range(len(text))]
         if not (0 <= row < self.height and column >= 0 and column + len(text) <= self.width):

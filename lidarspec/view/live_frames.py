@@ -1,7 +1,4 @@
-"""Read and count the frames of an open device without points.
-
-For a device with points, `open_live` returns its scans instead (`live_scans`).
-"""
+"""Read and count the frames of an open device without points."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Read, count and play the scans of an open device.
 
-`LiveScans.read` reads the data that has arrived, counts it in a `RateMeter` and keeps the newest
-scan. If a file is played, each scan is shown at its recorded time. The file is read only a little
-ahead of the shown scan, so that the statistics belong to this scan.
+If a file is played, each scan is shown at its recorded time. The file is read only a little ahead
+of the shown scan, so that the statistics belong to this scan.
 """
 
 from __future__ import annotations
@@ -52,8 +51,7 @@ class LiveScans:
         speed: the speed of a played file; it may be changed.
         packets: the batch that was read last; None if nothing arrived.
         scans: the complete and incomplete scans of the last `read` or `step`.
-        scan: the newest complete scan. Before the first complete scan, it is the newest incomplete
-            scan or None.
+        scan: the newest complete scan; before the first complete scan, an incomplete scan or None.
         number: number of times that `scan` has changed.
         meter: counts packets and scans.
         clock: watches the sensor's clock.
@@ -107,7 +105,7 @@ class LiveScans:
     def times_ns(self) -> Times:
         """Arrival times of the packets that were read last, (n,) ns.
 
-        If arrival times are unknown, these are the times of the sensor's clock.
+        If arrival times are unknown, the times of the sensor's clock are returned.
         """
         if self.packets is None:
             return np.zeros(0, np.int64)
@@ -151,10 +149,7 @@ class LiveScans:
         self.stop_clock()
 
     def stop_clock(self) -> None:
-        """Pause a played file.
-
-        The interval to the next scan begins when playing continues.
-        """
+        """Pause a played file."""
         self._due = None
 
     def _read(self) -> None:

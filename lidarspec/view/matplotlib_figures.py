@@ -1,7 +1,4 @@
-"""Draw figures for reports with matplotlib.
-
-The figures show a scan to scale, a histogram of intensities, ranges over time, and rates over time.
-"""
+"""Draw figures for reports with matplotlib."""
 
 from __future__ import annotations
 
@@ -82,10 +79,7 @@ def save(figure: Any, target: Any, suffix: str) -> None:
 
 @_with_style
 def draw_scan(scan: Scan, look: CloudAppearance, title: str) -> Any:
-    """Return a figure of a scan, seen from above with forward up.
-
-    The figure also has a view from the right side, unless `look` says that the cloud is flat.
-    """
+    """Return a figure of a scan, seen from above with forward up."""
     cloud = scan.points[scan.points.valid]
     column: Any
     if look.ramp == "range":
@@ -181,9 +175,6 @@ def draw_intensities(scans: Iterable[Scan], title: str) -> Any:
 def draw_ranges(scans: Iterable[Scan], title: str) -> Any:
     """Return a figure with the number of returns at each range and time.
 
-    The figure also shows the median range over time. If there are many scans, only every n-th scan
-    is shown.
-
     Args:
         scans: at least one scan.
         title: the title of the figure.
@@ -239,9 +230,7 @@ def draw_ranges(scans: Iterable[Scan], title: str) -> Any:
 
 @_with_style
 def draw_rates(rates: RateSeries, title: str) -> Any:
-    """Return a figure of the rates over time.
-
-    It shows packets and scans per second, and the shares of lost and invalid frames.
+    """Return a figure of packets and scans per second, and of lost and invalid frames.
 
     Raises:
         UsageError: if the packets have no times.
@@ -276,17 +265,13 @@ def draw_rates(rates: RateSeries, title: str) -> Any:
 class RateSeries:
     """Counts packets, lost packets and invalid frames in equal steps of time.
 
-    The times are arrival times, or times of the sensor's clock if arrival times are unknown.
-
     Args:
         live: the scans of an open device. They are read to the end, or until the time `until`.
         until: a time of `time.monotonic`.
 
     Attributes:
         width: the duration of a step, in seconds.
-        totals: numbers of packets, lost packets and invalid frames in each step, (3, n). Lost
-            packets and invalid frames are only counted per batch of packets, so they are
-            distributed evenly over the time of the batch.
+        totals: numbers of packets, lost packets and invalid frames in each step, (3, n).
         scans: (seconds since the first packet, scans per second) of each complete scan.
     """
 
@@ -332,14 +317,11 @@ class RateSeries:
         self.totals = grown + np.outer((1, lost / len(packets), wrong / len(packets)), counted)
 
     def series(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the totals of each time step.
-
-        Steps are joined so that there are at most `MAX_TIME_BINS`. The last step is omitted,
-        because it is incomplete.
+        """Return the totals of at most `MAX_TIME_BINS` time steps.
 
         Returns:
             The edges of the steps, (n + 1,) seconds, and the numbers of packets, lost packets and
-            invalid frames in each step, (3, n).
+                invalid frames in each step, (3, n).
         """
         if self._last < self.width:
             raise UsageError(

@@ -1,9 +1,8 @@
 """HTML and SVG for notebooks.
 
 Scans and clouds are shown as pictures, packets and explained frames as tables, sensors as packet
-diagrams. `lidarspec.notebook_display` calls the function for the type of a value. Texts are
-escaped, and the size of the output is limited. The output is readable on light and dark pages:
-pictures have a background, and tables use the text colour of the page.
+diagrams. Texts are escaped, and the size of the output is limited. The output is readable on light
+and dark pages: pictures have a background, and tables use the text colour of the page.
 """
 
 from __future__ import annotations
@@ -58,11 +57,7 @@ def cloud(value: PointCloud) -> str | None:
 
 
 def packets(value: Packets) -> str:
-    """Return the first and the last packets as an HTML table.
-
-    The columns are the offset, the times, and the fields in their units. For an array, the number
-    and the range of its values are shown.
-    """
+    """Return the first and the last packets as an HTML table."""
     fields = {path: info for path, info in value.table.schema.fields.items() if info.const is None}
     shown = dict(list(fields.items())[:MAX_FIELDS])
     columns: dict[str, list[str]] = {
@@ -92,10 +87,7 @@ def packets(value: Packets) -> str:
 
 
 def explanation(value: Explanation) -> str:
-    """Return every byte of a frame as an HTML table.
-
-    Each field has its own colour. Invalid values are red.
-    """
+    """Return every byte of a frame as an HTML table."""
     rows = []
     for number, row in enumerate(value.rows[:MAX_ROWS]):
         indent = "&nbsp;" * 2 * len(list_parents(row.path))
@@ -131,10 +123,7 @@ def explanation(value: Explanation) -> str:
 
 
 def sensor(value: Sensor) -> str:
-    """Return the packet diagrams of a sensor as HTML.
-
-    Each diagram can be opened and closed. At first, only the diagrams of data frames are open.
-    """
+    """Return the packet diagrams of a sensor as HTML."""
     head = (
         f"<b>{escape(escape_controls(f'{value.vendor} {value.model}'))}</b>"
         f" <code>{escape(value.id)}</code>, verified by {escape(value.status)}"
@@ -181,10 +170,7 @@ def _name_clock(packets: Packets) -> str:
 
 
 def _format_times(times: NDArray[np.int64]) -> list[str]:
-    """Return the times of the packets to show, as text, in seconds since the first.
-
-    An unknown time is "-".
-    """
+    """Return the times of the packets to show, as text, in seconds since the first."""
     return [
         f"{(at - int(times[0])) * 1e-9:.6f}" if at else "-"
         for at in times[_end_indices(len(times))].tolist()
@@ -216,7 +202,7 @@ def _format_number(value: float) -> str:
 def _make_table(
     caption: str, heads: Iterable[str], rows: Iterable[Sequence[str]], *, align: str = "left"
 ) -> str:
-    """Return an HTML table. Cells are HTML; the caption and the heads are plain text."""
+    """Return an HTML table; cells are HTML, the caption and the heads are plain text."""
     cell = _CELL.format(align=align)
     head = "".join(f'<th style="{cell}">{escape(escape_controls(name))}</th>' for name in heads)
     body = "\n".join(

@@ -1,7 +1,6 @@
 """The interface to the plugin that serves the page of `lidarspec view --web`.
 
-The page and its server are a separate distribution, `lidarspec-web`, because only they need a web
-framework.
+The page and its server are in the distribution `lidarspec-web`, because they need a web framework.
 """
 
 from __future__ import annotations
@@ -22,10 +21,7 @@ DISTRIBUTION = "lidarspec-web"
 
 
 class PageServer(AbstractContextManager["PageServer"], Protocol):
-    """Serves the page of a source; a context manager.
-
-    The end of the context closes the source.
-    """
+    """Serves the page of a source; a context manager that closes the source."""
 
     @property
     def link(self) -> str:
@@ -46,8 +42,8 @@ class PageServer(AbstractContextManager["PageServer"], Protocol):
     def opening_page(self) -> str:
         """Write a file that redirects to `link`, and return the URL of the file.
 
-        Other users can see the command line of a browser, so it must not contain the token in
-        `link`.
+        Start a browser with this URL. `link` contains a token, and other users can see the command
+        line of a browser.
 
         Raises:
             OSError: if the file cannot be written.
@@ -75,8 +71,6 @@ def open_page_server(
     report: Callable[[str], None],
 ) -> PageServer:
     """Open a source, and return the server of its page.
-
-    The hook `lidarspec_page` of a plugin makes the server.
 
     Args:
         source: the source, as the user typed it.

@@ -1,6 +1,6 @@
 """Draw clouds in character cells, seen from above, with range rings.
 
-Forward is up, and the sensor's left is at the left. 3D clouds are also drawn from the right side.
+The forward direction is up. 3D clouds are also drawn from the right side.
 """
 
 from __future__ import annotations
@@ -25,10 +25,7 @@ MAX_FILLED_SHARE = 0.9
 
 
 def draw_cloud(points: PointCloud, *, width: int, height: int, look: CloudAppearance) -> CellGrid:
-    """Draw a cloud from above, in `width` by `height` cells.
-
-    If `look` is not flat, the view from the right side is drawn below.
-    """
+    """Draw a cloud from above, in `width` by `height` cells."""
     cloud = points[points.valid]
     if look.flat:
         return _draw_from_above(cloud, width, height, look)
@@ -108,10 +105,7 @@ def _label_ring(canvas: Canvas, home: tuple[int, int], radius: float, scale: flo
 def _draw_from_side(
     cloud: PointCloud, width: int, height: int, look: CloudAppearance, scale: float
 ) -> tuple[CellGrid, int]:
-    """Return the view from the right side, and the magnification of heights.
-
-    The forward direction is to the right. The points are in the vertical middle of the view.
-    """
+    """Return the view from the right side, and the magnification of heights."""
     canvas = Canvas(width, height, look.ramp)
     inside = np.abs(cloud.x - look.middle[0]) <= canvas.dots.shape[1] / 2 / scale
     low, high = _find_heights(cloud.z[inside])
@@ -147,10 +141,7 @@ def _draw_from_side(
 
 
 def _find_heights(z: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the lowest and the highest z of the side view, in metres.
-
-    The view contains the sensor and most of the points.
-    """
+    """Return the lowest and the highest z of the side view, in metres."""
     if not len(z):
         return 0.0, 0.0
     low, high = (

@@ -1,8 +1,4 @@
-"""Measure a running sensor: speed, rates, losses and jitter.
-
-A `RateMeter` has two sets of counts of packets and scans: since its last reading, and from the
-beginning.
-"""
+"""Measure a running sensor: speed, rates, losses and jitter."""
 
 from __future__ import annotations
 
@@ -208,7 +204,7 @@ class RateMeter:
         self._count_packets(count, arrivals, by_host=True)
 
     def _count_packets(self, count: int, times: NDArray[np.int64], *, by_host: bool) -> None:
-        """Count packets and the gaps between their times. `times` is ascending, (n,) ns."""
+        """Count packets at times, which are ascending, (n,) ns."""
         previous = np.array([] if self._last_ns is None else [self._last_ns], np.int64)
         gaps = np.diff(np.concatenate([previous, times])) * 1e-9
         if len(times):
@@ -217,7 +213,7 @@ class RateMeter:
             tally.add_packets(count, gaps, by_host=by_host)
 
     def add_scan(self, scan: Scan) -> None:
-        """Count a scan. Incomplete scans are ignored, because they have fewer points."""
+        """Count a complete scan; ignore an incomplete scan."""
         if not scan.whole:
             return
         valid = int(scan.points.valid.sum())

@@ -32,7 +32,7 @@ def show(live: LiveScans, target: str, *, ramp: str = "range", until: float) -> 
         live: the scans of the open device.
         target: a file to write, the URL of a running viewer, or "" to open a viewer.
         ramp: the column that the colours show.
-        until: a time of `time.monotonic` at which to return, unless the input ends before.
+        until: a time of `time.monotonic` at which to return.
 
     Raises:
         UsageError: if no viewer can be opened, or the Rerun SDK is not installed.

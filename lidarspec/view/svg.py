@@ -1,7 +1,4 @@
-"""Draw a cloud as SVG, with the same views as in the terminal.
-
-The picture follows the light or dark colour scheme of the browser.
-"""
+"""Draw a cloud as SVG, in the light or dark colour scheme of the browser."""
 
 from __future__ import annotations
 
@@ -56,15 +53,12 @@ def svg(
 ) -> str:
     """Return a cloud as an SVG document, from above and from its right side.
 
-    If `look` is flat, the document has only the view from above.
-
     Args:
         points: the cloud.
-        look: the appearance.
+        look: the appearance; a flat cloud is drawn only from above.
         title: the title of the picture.
         side: side of the view from above, in pixels.
-        most: maximum number of dots in a view; None for no limit. A dot may represent several
-            returns.
+        most: maximum number of dots in a view; None for no limit.
     """
     cloud = points[points.valid]
     views = _ViewDrawer(cloud, look, side, most, ramp_indices(cloud, look))
@@ -106,7 +100,6 @@ class _View:
     """One view of a cloud.
 
     Attributes:
-        title: the title.
         parts: the SVG elements.
         top: the upper end of the view, in pixels.
         height: the height of the view, in pixels.
@@ -126,7 +119,6 @@ class _ViewDrawer:
 
     Attributes:
         cloud: the valid points.
-        look: the appearance.
         side: side of the view from above, in pixels.
         most: maximum number of dots in a view; None for no limit.
         colours: the colour of each point, as a step of the colour ramp, (n,).
@@ -234,9 +226,6 @@ class _ViewDrawer:
     ) -> tuple[int, list[str]]:
         """Return the number of dots, and SVG elements that draw them, one path per colour.
 
-        Points are rounded to a grid, and points at the same position are one dot. The grid is the
-        finest of `GRIDS_PX` with at most `self.most` dots.
-
         Args:
             across: horizontal coordinates of the points, (n,) pixels.
             down: vertical coordinates of the points, (n,) pixels.
@@ -270,8 +259,6 @@ class _ViewDrawer:
 class _Labels:
     """Places texts in a view so that they do not overlap or leave the view.
 
-    A text that does not fit is omitted.
-
     Args:
         side: width of the view, in pixels.
         top, bottom: vertical limits of the view, in pixels.
@@ -288,10 +275,9 @@ class _Labels:
         self.parts: list[str] = []
 
     def write(self, text: str, positions: Iterable[tuple[float, float]]) -> None:
-        """Write a text at the first position at which it fits.
+        """Write a text at the first position at which it fits, if any.
 
         Args:
-            text: the text.
             positions: possible positions of the left end of the base line, in pixels.
         """
         for left, base in positions:
@@ -346,8 +332,6 @@ def _iter_legend(look: CloudAppearance, right: int) -> Iterator[str]:
 
 def _style_of(part: str, attribute: str = "fill") -> str:
     """Return the SVG attributes for the colour of a part of the picture.
-
-    The attribute sets the colour for light pages, and the CSS class the colour for dark pages.
 
     Args:
         part: one of `_PARTS`.

@@ -1,8 +1,6 @@
 """Show pictures on the alternate screen of a terminal, and read single keys.
 
-Only changed cells are written. The library rich writes all cells of each picture, which are about
-50 times as many, so it is used only for output that is printed once. Single keys are read with
-termios on POSIX and with msvcrt on Windows.
+Only changed cells are written. The library rich would write all cells of each picture.
 """
 
 from __future__ import annotations
@@ -55,7 +53,7 @@ MAX_BRIDGED_CELLS = 4
 class KeyReader:
     """Reads keys; a context manager that restores the terminal.
 
-    This base class is used without a keyboard: `read` waits for the timeout and returns no keys.
+    This base class is used if there is no keyboard.
     """
 
     def read(self, timeout: float) -> list[str]:
@@ -119,10 +117,7 @@ else:
     import tty
 
     class Keyboard(KeyReader):
-        """Reads single keys of a terminal; Ctrl-C and Ctrl-Z still send signals.
-
-        The terminal does not print the keys.
-        """
+        """Reads single keys of a terminal; Ctrl-C and Ctrl-Z still send signals."""
 
         def __init__(self, descriptor: int) -> None:
             self._descriptor = descriptor
@@ -154,7 +149,7 @@ else:
         """Return the keyboard of the terminal, or `KeyReader()` if there is none.
 
         Args:
-            stdin_is_data: whether standard input is the data. Keys are then read from /dev/tty.
+            stdin_is_data: whether standard input is the data, so that keys are read from /dev/tty.
         """
         try:
             if sys.stdin.isatty() and not stdin_is_data:
@@ -177,10 +172,7 @@ class TerminatedError(BaseException):
 
 
 def find_colour_depth(stream: TextIO) -> Depth:
-    """Return the colour depth of a terminal.
-
-    It depends on the environment variables NO_COLOR, COLORTERM and TERM.
-    """
+    """Return the colour depth of a terminal."""
     console = Console(file=stream)
     system = console.color_system
     if system is None or console.no_color:
@@ -202,10 +194,7 @@ def supports_braille(stream: TextIO) -> bool:
 
 
 class Screen:
-    """The screen of a terminal; a context manager that restores the terminal.
-
-    The terminal is also restored if SIGTERM or SIGHUP ends the process, or SIGTSTP suspends it.
-    """
+    """The screen of a terminal; a context manager that restores the terminal."""
 
     def __init__(self, stream: TextIO, keys: KeyReader) -> None:
         self._stream = stream
@@ -293,7 +282,7 @@ class Screen:
 
 
 def encode_changes(before: CellGrid | None, after: CellGrid, depth: Depth) -> str:
-    """Return the escape sequences and text that replace the shown picture by another.
+    """Return the escape sequences and text that change the shown picture.
 
     Args:
         before: the shown picture; None for an empty screen.

@@ -1,9 +1,4 @@
-"""The terminal window of a running sensor, drawn at most twelve times a second.
-
-`Window.run` alternately reads keys and data. Keys change the `ViewSettings`. `Window.cells` draws
-the window from these settings, the newest scan and the statistics. `Screen` writes the changed
-cells.
-"""
+"""The terminal window of a running sensor, drawn at most twelve times a second."""
 
 from __future__ import annotations
 
@@ -120,7 +115,7 @@ class Window:
         live: the scans of the open device.
         source: the SOURCE as typed by the user.
         ramp: the column that the colours show at first.
-        record: switches the recording of a live source on and off; None for other sources.
+        record: switches the recording of a live source on and off; None for a file.
         duration: seconds after which the window closes; None if only a key closes it.
     """
 
@@ -179,10 +174,7 @@ class Window:
         return screen.keys.read(0)
 
     def cells(self, columns: int, lines: int) -> CellGrid:
-        """Draw the window, with the statistics at the right of the picture.
-
-        If the window is small, the statistics are in its last line.
-        """
+        """Draw the window, with the statistics at the right or in the last line."""
         self._update_reading()
         self._update_scan()
         is_wide = columns > MIN_PICTURE_COLUMNS + SIDE_COLUMNS and lines >= MIN_SIDE_LINES

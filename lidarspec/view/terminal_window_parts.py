@@ -1,7 +1,4 @@
-"""The parts of the terminal window around the picture.
-
-These are the title, the statistics, the colours, the keys and messages.
-"""
+"""The parts of the terminal window around the picture: statistics, colours, keys."""
 
 from __future__ import annotations
 
@@ -49,12 +46,9 @@ def write_title(window: CellGrid, sensor: str, source: str, state: str, ink: int
 
 
 def shorten_source(source: str, room: int) -> str:
-    """Return the source, or only its end if it is too long.
-
-    Returns "" if there is space for fewer than `MIN_SOURCE_COLUMNS`.
+    """Return the source, or only its end if it is too long, or "" without space.
 
     Args:
-        source: the source.
         room: number of characters that are available.
     """
     if len(source) <= room:
@@ -69,10 +63,7 @@ def write_side(
 ) -> None:
     """Write statistics, colours and keys at the right of the picture.
 
-    Lines that do not fit are omitted.
-
     Args:
-        window: the window with the picture.
         left: the first column to the right of the picture.
         figures: the statistics, one per line.
         look: the appearance of the picture.
