@@ -5,12 +5,11 @@
     s = ls.sensor("vendor-model")
     s.parse(frame), s.build("data", ...), s.decode(data).points(), s.scans(data), ls.open(source, s)
 
-This module has the functions and classes for reading a lidar. Those for describing a sensor are in
-`lidarspec.spec`, and exceptions are in `lidarspec.errors`. All are imported on first use, so that
-``lidarspec --help`` starts quickly.
+This module has the functions and classes for reading a lidar. The classes for describing a sensor
+are in `lidarspec.spec`, and the exceptions in `lidarspec.errors`. All are imported on first use, so
+that ``lidarspec --help`` starts quickly.
 
-The packages are listed in the order in which data passes through them, and import each other in one
-direction only. The docstring of each package says what it takes and returns:
+The packages are listed in the order in which data passes through them:
 
     spec        description of a sensor        packets     frames of one type as columns
     frames      parsing and building a frame   points      packets as point clouds
@@ -25,8 +24,7 @@ direction only. The docstring of each package says what it takes and returns:
     plugins     installed sensors and hooks    testing     test kit for sensors
     cli         command line
 
-The class `Sensor` is in `sensor_operations`. It is a description from `spec` with methods that call
-these packages.
+The class `Sensor`, a description with methods, is in `sensor_operations`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Find entry points by group without importing the distributions that declare them.
 
-The folders on `sys.path` are read directly, because importing importlib.metadata takes longer than
-everything else needed to find a sensor. importlib.metadata is used only if a distribution may be
-installed in a zip file or an egg, or through an import hook.
+The folders on `sys.path` are read directly, because importing importlib.metadata is slow.
+importlib.metadata is used only if a distribution may be installed in a zip file or an egg, or
+through an import hook.
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ class EntryPoint(NamedTuple):
     """One entry point and the distribution that declares it.
 
     Attributes:
-        name: its name.
         value: "module" or "module:object".
         distribution, version: name and version of the distribution; "?" if unknown.
     """
@@ -65,10 +64,7 @@ class EntryPoint(NamedTuple):
 
 
 def entry_points(group: str) -> list[EntryPoint]:
-    """Return every entry point of a group, sorted by name and value.
-
-    If several distributions have the same name, the first on `sys.path` is used.
-    """
+    """Return every entry point of a group, sorted by name and value."""
     try:
         entries = [
             entry for folder in _iter_distributions() for entry in _iter_declared(folder, group)
@@ -79,10 +75,7 @@ def entry_points(group: str) -> list[EntryPoint]:
 
 
 def _iter_distributions() -> Iterator[str]:
-    """Yield the metadata folder of each installed distribution.
-
-    If several distributions have the same name, the first on `sys.path` is used.
-    """
+    """Yield the metadata folder of each installed distribution."""
     if any(
         hasattr(finder, "find_distributions") and finder is not PathFinder
         for finder in sys.meta_path
@@ -116,11 +109,7 @@ def _list_names(path: str) -> list[str]:
 
 
 def _iter_declared(folder: str, group: str) -> Iterator[EntryPoint]:
-    """Yield the entry points of a group that one distribution declares.
-
-    A file that is not UTF-8 is reported by an additional entry in the group `GROUP`. This entry has
-    no module, and its `load` raises an error.
-    """
+    """Yield the entry points of a group that one distribution declares."""
     text = _read_text(folder, "entry_points.txt")
     is_damaged = "\ufffd" in text and group == GROUP
     if not is_damaged and f"[{group}]" not in text:

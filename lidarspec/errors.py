@@ -1,10 +1,9 @@
 """The exceptions of lidarspec: one class for each party that may be at fault.
 
-``SpecError`` reports a mistake of a plugin's author, and its subclass ``PluginError`` a function
-of a plugin that fails. ``UsageError`` reports a mistake of the caller. ``WireError`` reports bytes
+``SpecError`` reports a mistake of a plugin's author, and its subclass ``PluginError`` a function of
+a plugin that fails. ``UsageError`` reports a mistake of the caller. ``WireError`` reports bytes
 that are not the expected frame, ``SourceError`` a failure of the system, and ``CommandError`` a
-failure of the device. Noise in a stream is not an error: decoders count it. If an error has
-details, such as an offset, programs can read them from the attributes of the exception.
+failure of the device. Noise in a stream is not an error: decoders count it.
 """
 
 from __future__ import annotations
@@ -93,8 +92,8 @@ class PluginError(SpecError):
 
         Args:
             what: the text that names the function in the message, such as "points of data".
-            function: the function. If no code of the plugin was running, the first line of this
-                function is the location.
+            function: the function, whose first line is the location if no code of the plugin was
+                running.
         """
         from traceback import format_exception  # only needed after a failure
 
@@ -127,8 +126,7 @@ class PluginError(SpecError):
 def escape_controls(text: str) -> str:
     """Return text with escaped control characters such as `\\x1b`.
 
-    Line ends and tabs are kept. Control characters are all characters that control a terminal or
-    change the direction of writing.
+    Line ends and tabs are kept.
     """
     if text.isascii() and text.replace("\n", "").isprintable():
         return text
@@ -154,11 +152,7 @@ def format_path(file: str) -> str:
 
 
 def find_plugin_line(error: BaseException) -> tuple[str, int]:
-    """Return file and line of the plugin's code that raised an exception.
-
-    This is the innermost frame of the traceback outside lidarspec and libraries. Returns "" and 0
-    if there is none.
-    """
+    """Return file and line of the plugin's code that raised an exception, or "" and 0."""
     from traceback import extract_tb
 
     ours = os.path.join(os.path.dirname(__file__), "")
@@ -278,9 +272,6 @@ def did_you_mean(
 ) -> str:
     """Return a clause such as ``; did you mean 'speed'?``; "" if no name is similar.
 
-    All names that contain the unknown name are suggested. If there are none or too many of them,
-    the most similar name is suggested.
-
     Args:
         name: the unknown name.
         known: the valid names.
@@ -394,11 +385,9 @@ class UnknownSensor(UnknownName):
     """No installed sensor has this id or alias.
 
     Attributes:
-        distribution: the distribution that has the sensor, if it is known that this distribution is
-            not installed or failed to load; otherwise "".
+        distribution: the distribution that has the sensor, if the distribution is known but not
+            available; otherwise "".
         failure: the reason why the installed distribution failed to load; otherwise "".
-
-    If `distribution` is not "", the message ends with it instead of `hint`.
     """
 
     what = "sensor"
@@ -506,7 +495,7 @@ class WriteError(SourceError):
         reason: the reason, without the path.
 
     Args:
-        state: the state in which the file is left, for the message.
+        state: the state of the file after the error, for the message.
     """
 
     def __init__(self, path: str, reason: str, state: str) -> None:

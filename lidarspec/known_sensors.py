@@ -1,10 +1,8 @@
 """The sensors of this project's distributions, installed or not, read from a table.
 
 The table `known_sensors.json` is generated from the plugins by `make known-sensors`, and is the
-only place in the core that names sensors. It serves two purposes: messages can name the
-distribution of a sensor that is not installed, and installed sensors can be listed without loading
-their plugins. A row of the table describes a sensor in one version of its distribution. It is used
-only if this version is installed, and if its entry points have the names in the row.
+only place in the core that names sensors. With the table, messages can name the distribution of a
+sensor that is not installed, and installed sensors can be listed without loading their plugins.
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ class KnownLink(NamedTuple):
 
     Attributes:
         kind: "serial", "udp", "tcp" or another kind.
-        numbers: its baud rates or ports, the most likely first.
+        numbers: the baud rates or ports, the most likely first.
     """
 
     kind: str
@@ -40,8 +38,7 @@ class Signature(NamedTuple):
     """The constant bytes at the start of a data frame, and the size of the frame.
 
     Attributes:
-        sync: the bytes as hexadecimal text, such as "54 .. 2c"; ".." is a byte that is not
-            constant.
+        sync: the bytes as hexadecimal text, such as "54 .. 2c"; ".." is a byte that varies.
         size: the size of the frame in bytes; 0 if it varies.
     """
 
@@ -105,8 +102,6 @@ def known_sensors() -> tuple[KnownSensor, ...]:
 def describe_entry_points(entries: Iterable[EntryPoint]) -> list[KnownSensor]:
     """Return the rows of the table that are correct for the installed distributions.
 
-    A row is correct if the version and the names in the row are those of the entry points.
-
     Args:
         entries: the entry points of all installed sensors.
     """
@@ -122,11 +117,7 @@ def describe_entry_points(entries: Iterable[EntryPoint]) -> list[KnownSensor]:
 
 
 def list_described_sensors() -> list[KnownSensor] | None:
-    """Return a row for each installed sensor, sorted by id; None if rows are missing.
-
-    Rows are missing if a plugin has hooks, belongs to another project, or has the same name as
-    another plugin. In this case, the plugins must be loaded.
-    """
+    """Return a row for each installed sensor, sorted by id; None if rows are missing."""
     if entry_points(GROUP):
         return None
     entries = entry_points(SENSORS)
@@ -159,11 +150,7 @@ def _keep_letters(name: str) -> str:
 
 
 def install_command(*distributions: str, extra: str = "") -> str:
-    """Return the command that installs distributions of this project.
-
-    The distributions are not on a package index yet. The command therefore names folders of the
-    checkout from which lidarspec runs, or else the repository.
-    """
+    """Return the command that installs distributions of this project."""
     extras = f"[{extra}]" if extra else ""
     plugins = os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), "plugins")
     if os.path.isdir(plugins):
@@ -203,8 +190,7 @@ def unknown_sensor_error(
         name: an id or alias.
         installed: the ids of the installed sensors.
         aliases: alias -> id of an installed sensor.
-        failures: the plugins that failed to load, one of which may contain the sensor:
-            distribution -> reason.
+        failures: distribution -> the reason why the plugin failed to load.
     """
     row = find_known_sensor(name)
     if row is not None:

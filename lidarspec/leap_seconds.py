@@ -1,10 +1,9 @@
 """Leap seconds: the offsets of TAI and GPS time from UTC.
 
-TAI and GPS time count all seconds. At each leap second, UTC falls behind them by one more second.
-GPS time is always 19 s behind TAI. The dates of the leap seconds are read from a table of the
-operating system or of the package tzdata. The table has the format `leapseconds` of the time zone
-compiler, or the format `leap-seconds.list` of NTP. The table with the latest expiry date is used.
-Without a table, the offset since 2017 is used for all times.
+TAI and GPS time count all seconds. At each leap second, UTC falls behind by one more second. GPS
+time is always 19 s behind TAI. The dates of the leap seconds are read from the newest table of the
+operating system or of the package tzdata. Without a table, the offset since 2017 is used for all
+times.
 
 Source: IERS Bulletin C; tz database, `leapseconds`; NIST, `leap-seconds.list`.
 """
@@ -62,9 +61,7 @@ class LeapSeconds:
         return self.tai_minus_utc(utc_s) - TAI_MINUS_GPS_S
 
     def scale_offsets(self, utc_s: float) -> dict[str, int]:
-        """Return the offset of each time scale from UTC in seconds, by name.
-
-        The names are "utc", "tai" and "gps".
+        """Return the offsets of "utc", "tai" and "gps" from UTC in seconds, by name.
 
         Args:
             utc_s: the time at which the offsets are valid, seconds since 1970.
@@ -78,7 +75,7 @@ class LeapSeconds:
     def utc_from_tai(self, tai_s: ArrayLike) -> NDArray[Any]:
         """Return the UTC of times in TAI; both are seconds since 1970.
 
-        A leap second repeats the second before it, as in the clock of an operating system.
+        A leap second repeats the second before it.
 
         Args:
             tai_s: the times, of any shape.

@@ -1,7 +1,7 @@
 """The methods with which notebooks display values.
 
-IPython calls a method of the value, and this method calls a function of `lidarspec.view.notebook`.
-That module imports the classes of all values, so it is imported only when a value is displayed.
+`lidarspec.view.notebook` draws the values. This module is separate, so that `lidarspec.view` is
+imported only when a value is displayed.
 """
 
 from __future__ import annotations
@@ -15,9 +15,7 @@ DRAWING = "lidarspec.view.notebook"
 
 
 def make_display_method(kind: str) -> Callable[[Any], str | None]:
-    """Return a method that displays a value in notebooks.
-
-    The method returns HTML, or None if the value is to be displayed as text.
+    """Return a method that returns a value as HTML, or None to display it as text.
 
     Args:
         kind: the name of the function in `lidarspec.view.notebook` that draws the value.

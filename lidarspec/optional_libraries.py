@@ -1,8 +1,7 @@
 """Import optional libraries, and check that their versions are new enough.
 
-An extra is a set of libraries that `pip install lidarspec[EXTRA]` installs. All optional libraries
-are imported by `import_library`. It first compares the installed version with `EXTRAS`, because an
-old version may be imported without an error, but lack a function that is needed later.
+An extra is a set of libraries that `pip install lidarspec[EXTRA]` installs. `EXTRAS` has the
+libraries of each extra with their oldest usable versions.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ def import_library(module: str, extra: str) -> Any:
     """Import and return a module of an optional library.
 
     Args:
-        module: its full name, such as "rosbags.typesys".
+        module: the full name, such as "rosbags.typesys".
         extra: the extra that installs the library, a key of `EXTRAS`.
 
     Raises:
@@ -88,11 +87,7 @@ def import_library(module: str, extra: str) -> Any:
 
 
 def find_requirement(module: str, extra: str) -> Requirement | None:
-    """Return the requirement of a module's library; None if `EXTRAS` does not have it.
-
-    `EXTRAS` has no modules of the standard library, such as `compression.zstd`, and no libraries
-    that another library requires, such as `distributed`.
-    """
+    """Return the requirement of a module's library; None if `EXTRAS` does not have it."""
     for name, requirement in EXTRAS[extra].items():
         if module == name or module.startswith(f"{name}."):
             return requirement
@@ -102,8 +97,6 @@ def find_requirement(module: str, extra: str) -> Requirement | None:
 @functools.cache  # reading the version takes most of a millisecond
 def check_version(requirement: Requirement, extra: str) -> None:
     """Raise an exception if the installed version of a library is too old.
-
-    A library that is missing, or has no metadata, passes.
 
     Raises:
         LibraryError: if the version is too old; the message has both versions.

@@ -1,14 +1,11 @@
 """Plugins: their hooks, and the registry of installed plugins.
 
 A distribution names its sensors in the entry-point group ``lidarspec.sensors``, with one entry for
-each id and alias, so that a request for one sensor loads only one plugin. The registry reads the
-aliases of a sensor from these entries. A module with hooks is named in the group ``lidarspec``, and
-is loaded before any sensor is returned. A hook is a function with one of the names below, marked
-with ``@hookimpl``.
+each id and alias, so that a request for one sensor loads only one plugin. A module with hooks is
+named in the group ``lidarspec``, and is loaded before any sensor is returned. A hook is a function
+with the name of a hook of this module, marked with ``@hookimpl``.
 
-Each plugin is loaded separately. If a plugin cannot be imported, has an unknown hook or adds an
-invalid sensor, none of its hooks and sensors are used, and it is reported with its distribution and
-error. Other plugins are not affected.
+If a plugin cannot be loaded, its error is reported, and no other plugin is affected.
 """
 
 from __future__ import annotations
@@ -84,25 +81,17 @@ def lidarspec_sensors() -> Iterable[Sensor]:  # type: ignore[empty-body]
 
 @hookspec(firstresult=True)
 def lidarspec_checksum(sensor: Sensor, frame: Frame) -> Checksum | None:
-    """Return the checksum algorithm of a frame type; None keeps the declared one.
-
-    A hook cannot change which bytes the checksum covers, or which field stores it.
-    """
+    """Return the checksum algorithm of a frame type; None keeps the declared one."""
 
 
 @hookspec(firstresult=True)
 def lidarspec_points(sensor: Sensor, fields: Any) -> Points | None:
-    """Return the points of a batch of packets; None to use the sensor's own function.
-
-    A hook can, for example, apply a calibration.
-    """
+    """Return the points of a batch of packets; None to use the sensor's own function."""
 
 
 @hookspec(firstresult=True)
 def lidarspec_source(url: str, sensor: Sensor | None) -> Any:
-    """Return a transport for a URL scheme, or None.
-
-    It is called for schemes that lidarspec itself does not support.
+    """Return a transport for a URL scheme that lidarspec does not support, or None.
 
     Args:
         url: the source as the user typed it.
@@ -112,13 +101,11 @@ def lidarspec_source(url: str, sensor: Sensor | None) -> Any:
 
 @hookspec(firstresult=True)
 def lidarspec_link(source: str, link: Link, host: str | None) -> Any:
-    """Return the open transport of a link for commands, or None.
-
-    It is called for kinds of links that lidarspec itself does not support.
+    """Return the open transport of a link that lidarspec does not support, or None.
 
     Args:
         source: the source of the data.
-        link: the declared link.
+        link: the declared link, for commands.
         host: the address of the sensor; None if unknown.
     """
 
@@ -143,8 +130,7 @@ def lidarspec_page(
 ) -> Any:
     """Open a source, and return the `lidarspec.view.page_server.PageServer` of its page.
 
-    `lidarspec view --web` calls this hook in the module that the entry-point group `lidarspec.page`
-    names.
+    The module of this hook is named in the entry-point group `lidarspec.page`.
 
     Args:
         source: the source as the user typed it.
@@ -198,12 +184,12 @@ class Plugin:
         distribution: the name of the distribution that contains the plugin.
         version: the version of this distribution.
         entry_point: the entry point that declares the plugin.
-        sensors: the ids that it adds.
-        error: the reason why the plugin or one of its ids is not available; "" if everything is
-            available.
+        sensors: the ids that the plugin adds.
+        error: the reason why the plugin or one of its ids is not available; "" if there is no
+            error.
         rule: the code of the rule of `lidarspec check` that explains the error; "" if there is
             none.
-        failed_sensor: the id that the error concerns; "" if it concerns the whole plugin.
+        failed_sensor: the id that the error concerns; "" if the error concerns the whole plugin.
         traceback: the traceback of the error.
         remark: a description of side effects of loading the plugin, such as printed text.
     """
@@ -242,10 +228,9 @@ class Registry:
 
     Args:
         modules: entry points of modules with hooks, which are loaded immediately.
-        offered: entry points of sensors, which are loaded on request. The name of each is an id or
-            alias.
+        offered: entry points of sensors, which are loaded on request, named by id or alias.
         owners: a function that returns the distributions that the user's settings name as owners,
-            by id. It is called if several distributions claim a name.
+            by id.
     """
 
     def __init__(
@@ -274,19 +259,13 @@ class Registry:
 
     @property
     def plugins(self) -> list[Plugin]:
-        """All installed plugins.
-
-        A plugin has an `error` if it failed to load, or if another plugin owns one of its ids.
-        """
+        """All installed plugins, with an `error` if an id of the plugin is not available."""
         self._load_all()
         offered = [self._load_module(entries) for entries in self._offered.values()]
         return [self._drop_lost_names(plugin) for plugin in (*self._modules, *offered)]
 
     def _drop_lost_names(self, plugin: Plugin) -> Plugin:
-        """Return a plugin without the ids that another plugin owns.
-
-        If there are such ids, the returned plugin has an error that names the first of them.
-        """
+        """Return a plugin without the ids that another plugin owns."""
         home = plugin.home
         own = sorted(name for name in self._sensors.get(home, {}) if self._find_owner(name) == home)
         lost = [
@@ -313,8 +292,8 @@ class Registry:
         """Register a module or object with hooks, and return the ids that it adds.
 
         Raises:
-            SpecError: for an unknown hook, a wrong signature, or an invalid sensor. In this case,
-                nothing is registered.
+            SpecError: for an unknown hook, a wrong signature, or an invalid sensor; nothing is
+                registered.
         """
         _check_hooks(plugin, name)
         try:
@@ -347,10 +326,7 @@ class Registry:
                 self._load(entry)
 
     def _add_offered(self, entry: EntryPoint, sensor: Any) -> list[str]:
-        """Store the sensor of an entry point, and return a list with the sensor's id.
-
-        The names of all other entry points of the sensor are added to its aliases.
-        """
+        """Store the sensor of an entry point, and return a list with the sensor's id."""
         self._check(sensor, [sensor])
         home = (entry.distribution, entry.module)
         names = {other.name for other in self._offered[home] if other.value == entry.value}
@@ -387,11 +363,7 @@ class Registry:
                 self._claims.setdefault(name, {}).setdefault(home, claimed)
 
     def _find_owner(self, name: str) -> Home | None:
-        """Return the plugin that provides the sensor with a name.
-
-        Returns None if no plugin claims the name, or if several plugins claim the name and no rule
-        decides between them.
-        """
+        """Return the plugin that provides the sensor with a name, or None if undecided."""
         claims = self._claims.get(name, {})
         homes = [home for home, claimed in claims.items() if claimed] or list(claims)
         first = {normalise_name(home[0]): home for home in reversed(homes)}
@@ -414,10 +386,7 @@ class Registry:
     def _find_same_names(self, home: Home, name: str) -> set[str]:
         """Return all names under which a plugin registers a sensor.
 
-        If the sensor is not loaded, only the names of its entry points are known.
-
         Args:
-            home: the plugin.
             name: one of the names.
         """
         entries = self._offered.get(home, [])
@@ -473,10 +442,7 @@ class Registry:
         return self.find(name) is not None
 
     def find(self, name: str) -> Sensor | None:
-        """Return the sensor with an id or alias; None if there is none.
-
-        Only the plugin whose entry point has this name is loaded.
-        """
+        """Return the sensor with an id or alias; None if there is none."""
         if self._find_owner(name) is None or self._find(name) is None:
             return None
         return self.sensor(name)
@@ -491,10 +457,7 @@ class Registry:
 
     @property
     def failures(self) -> list[Plugin]:
-        """The plugins that failed to load, or whose ids another plugin owns.
-
-        Plugins that were not loaded yet are not included.
-        """
+        """The plugins with an error, without the plugins that were not loaded yet."""
         offered = [
             self._load_module([entry for entry in entries if entry in self._tried])
             for entries in self._offered.values()
@@ -507,10 +470,7 @@ class Registry:
         ]
 
     def list_sensors(self) -> list[KnownSensor]:
-        """Return a row for each installed sensor, sorted by id.
-
-        Only plugins that the table of known sensors does not describe are loaded.
-        """
+        """Return a row for each installed sensor, sorted by id."""
         described = describe_entry_points(itertools.chain.from_iterable(self._offered.values()))
         names = {(row.distribution, name) for row in described for name in row.names}
         for entries in self._offered.values():
@@ -544,8 +504,7 @@ class Registry:
         Upper and lower case, and the separators in the name, make no difference.
 
         Raises:
-            UnknownSensor: if no sensor has this name. The message suggests similar names, or the
-                packages to install if no sensor is installed.
+            UnknownSensor: if no sensor has this name; the message suggests names or packages.
             UsageError: if several distributions claim the name, and none owns it.
         """
         if name in self._ready:
@@ -584,10 +543,7 @@ class Registry:
         return None
 
     def _list_failed_modules(self) -> dict[str, str]:
-        """Return the modules with hooks that failed to load: distribution -> error.
-
-        It is not known which sensors such a module would have added.
-        """
+        """Return the modules with hooks that failed to load: distribution -> error."""
         return {
             plugin.distribution: plugin.error
             for plugin in self._modules
@@ -622,10 +578,7 @@ class Registry:
         return getattr(self._manager.hook, hook)(**arguments)
 
     def _apply_checksum_hooks(self, sensor: Sensor, frame: Frame) -> Frame:
-        """Return a frame with the checksum of the first hook that provides a checksum.
-
-        If a hook raises an exception, the error is recorded and the next hook is called.
-        """
+        """Return a frame with the checksum of the first hook that provides a checksum."""
         arguments = {"sensor": sensor, "frame": frame}
         for hook in reversed(self._manager.hook.lidarspec_checksum.get_hookimpls()):
             try:
@@ -732,8 +685,6 @@ def named_owners() -> dict[str, str]:
 def _import_in_time(entry: EntryPoint) -> Any:
     """Import an entry point, and return its module or object.
 
-    If the import hangs, its thread keeps running.
-
     Raises:
         SpecError: if the import hangs.
         BaseException: any exception of the import.
@@ -786,10 +737,7 @@ def _describe_location(thread: threading.Thread) -> str:
 
 
 def _load_entry(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> Plugin:
-    """Load and register an entry point; return the resulting plugin.
-
-    If loading fails, the plugin has the error, and other plugins are not affected.
-    """
+    """Load and register an entry point; return the plugin, with its error if any."""
     plugin = Plugin(entry.distribution, entry.version, f"{names} = {entry.value}")
     try:
         return replace(plugin, sensors=tuple(add(_import_in_time(entry))))
@@ -893,11 +841,7 @@ def _list_hook_modules() -> list[EntryPoint]:
 
 
 def _try_loading_all(homes: list[Home]) -> dict[Home, tuple[str, str]]:
-    """Return the result of `_try_loading` for each plugin.
-
-    First, one process loads all plugins. If this fails, each plugin is loaded in a process of its
-    own.
-    """
+    """Return the result of `_try_loading` for each plugin."""
     from concurrent.futures import ThreadPoolExecutor
 
     nothing_wrong = ("", "")
@@ -946,11 +890,7 @@ def _try_loading(*homes: Home) -> tuple[str, str]:
 
 
 def load_alone() -> None:
-    """Load the plugins in `sys.argv`, print the threads that keep running, and exit.
-
-    `_try_loading` runs this function in another process. In the output, a marker precedes the names
-    of the threads.
-    """
+    """Load the plugins in `sys.argv`, print the threads that keep running, and exit."""
     import faulthandler
 
     *names, mark, limit = sys.argv[1:]
@@ -1078,9 +1018,7 @@ def _load_file(text: str) -> Sensor:
 
 
 def import_file(file: Path) -> ModuleType:
-    """Import a file as a module.
-
-    The module has a unique name in `sys.modules`, because dataclasses, pickle and typing need it.
+    """Import a file as a module with a unique name.
 
     Raises:
         SourceError: if the file is missing.

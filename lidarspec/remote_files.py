@@ -1,6 +1,6 @@
-"""Files in remote stores, such as s3://bucket/drives/a.pcap.
+"""Files in remote stores, such as s3://bucket/drives/a.pcap, opened by fsspec.
 
-They are opened by the library fsspec. All functions also accept paths of local files.
+All functions also accept paths of local files.
 """
 
 from __future__ import annotations
@@ -107,9 +107,7 @@ def find_files(pattern: str) -> list[tuple[str, str]]:
 
 
 def files_in(folder: str) -> set[str]:
-    """Return the normalised paths of all files and folders below a folder.
-
-    Returns an empty set if the folder does not exist.
+    """Return the normalised paths of all files and folders below a folder, if any.
 
     Raises:
         SourceError: if the store cannot be reached.
@@ -128,10 +126,7 @@ def files_in(folder: str) -> set[str]:
 
 
 def normalise_path(path: object) -> str:
-    """Return a normalised path or URL for comparison.
-
-    For example, memory:///a and memory://a give equal results, and so do ./a and a.
-    """
+    """Return a normalised path or URL for comparison."""
     if is_remote(path):
         return str(path).partition("://")[2].lstrip("/")
     return Path(str(path)).as_posix().removeprefix("./")
@@ -143,7 +138,7 @@ def read_stamp(path: str) -> dict[str, Any]:
     Some stores provide a tag instead of the time.
 
     Raises:
-        SourceError: if there is no such file.
+        SourceError: if the file does not exist.
     """
     if not is_remote(path):
         with system_errors(path):
@@ -193,7 +188,7 @@ def remove(path: str | Path) -> None:
     """Remove a file or folder, if there is one.
 
     Raises:
-        SourceError: if that fails.
+        SourceError: if the file or folder cannot be removed.
     """
     if is_remote(path):
         system = find_file_system(str(path))
@@ -219,10 +214,7 @@ def _convert_failures(url: str) -> Iterator[None]:
 
 
 def _failure_reason(url: str, error: Exception) -> str:
-    """Return the reason why a store failed.
-
-    Many drivers report only the URL or path of a missing file, which is not a reason.
-    """
+    """Return the reason why a store failed."""
     text = str(error)
     if (
         normalise_path(text) != normalise_path(url)

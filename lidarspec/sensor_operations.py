@@ -1,8 +1,7 @@
-"""The class `Sensor`: a sensor's description, with the engines as methods.
+"""The class `Sensor`: a sensor's description, and a method for each main function.
 
-The engines are the packages `frames`, `framing`, `packets` and `scans`, whose functions take a
-`SensorDescription`. `Sensor` has a method for each main function. The method imports its engine on
-the first call, so that no engine is imported to list or configure sensors.
+The functions are in the packages `frames`, `framing`, `packets` and `scans`. A method imports its
+package on the first call, so that no package is imported to list or configure sensors.
 """
 
 from __future__ import annotations
@@ -91,8 +90,7 @@ class Sensor(SensorDescription):
         Args:
             frame: the name of its type; by default it is identified.
             verify: if False, wrong constants, a wrong checksum and trailing bytes are accepted.
-            units: whether to return physical values, which ``build(units=True)`` accepts. Scaled
-                fields are then in their units, and other fields unchanged.
+            units: whether to return scaled fields in their units, as ``build(units=True)`` accepts.
 
         Raises:
             WireError: if the bytes are not a valid frame of the type. The error has the sensor, the
@@ -209,10 +207,7 @@ class Sensor(SensorDescription):
     def _decode(
         self, data: Any, frame: str | None, backend: str
     ) -> tuple[Packets, WaitingSamples | None]:
-        """Return the packets of a frame type, and the IMU samples.
-
-        If `frame` is given, or if the sensor has no IMU, None is returned instead of the samples.
-        """
+        """Return the packets of a frame type, and the IMU samples or None."""
         from lidarspec.framing.decoder import decode_all, is_stream
         from lidarspec.packets.stream import ImuStream, PacketStream, choose_data_frame
 

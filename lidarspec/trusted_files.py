@@ -48,10 +48,8 @@ def own_settings() -> Path:
 def find_distrust(path: Path) -> str:
     """Return the reason why a file is not the user's own; "" if it is.
 
-    An example is "/tmp belongs to user 0". The file and its folder must belong to the user, and
-    must not be writable by all users. They may be writable by the group, because a user's group
-    often has no other members. On systems without file owners, all files in the user's folder are
-    the user's own.
+    The file and its folder must belong to the user, and must not be writable by all users. On
+    systems without file owners, all files in the user's folder are the user's own.
     """
     if not hasattr(os, "getuid"):
         home = os.path.expanduser("~")
@@ -72,7 +70,6 @@ def describe_sharing(status: os.stat_result, others: int) -> str:
     Returns "" if no other user can, and always on Windows.
 
     Args:
-        status: the status of the file.
         others: mode bits that the file must not have.
     """
     if os.name == "nt":
@@ -104,7 +101,7 @@ def trust(folder: str | Path) -> Path:
         The absolute path of the folder.
 
     Raises:
-        UsageError: if it is not a folder, or not the user's own.
+        UsageError: if `folder` is not a folder, or not the user's own.
         SourceError: if the list of allowed folders cannot be written.
     """
     from pathlib import Path
@@ -127,7 +124,6 @@ def resolve_beside(folder: Path, value: object) -> Path:
     """Return the path of a file in a folder.
 
     Args:
-        folder: the folder.
         value: the path of the file relative to the folder, from an untrusted source.
 
     Raises:
@@ -147,7 +143,7 @@ def read_document(path: Path, kind: Literal["TOML", "JSON"] = "TOML") -> Any:
 
     Raises:
         UsageError: if the file is invalid or too large.
-        SourceError: if it cannot be read.
+        SourceError: if the file cannot be read.
     """
     import json  # imported here because finding an installed sensor does not need them
     import tomllib
