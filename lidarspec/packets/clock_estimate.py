@@ -59,7 +59,13 @@ class ClockSample(NamedTuple):
 
 
 class ClockLine(NamedTuple):
-    """The shortest delay of packets as a linear function of the sensor's time."""
+    """The shortest delay of packets as a linear function of the sensor's time.
+
+    Attributes:
+        device: any time by the sensor's clock, ns.
+        delay: the shortest delay at this time, ns.
+        slope: the change of the delay divided by the change of the sensor's time.
+    """
 
     device: int
     delay: int
@@ -139,7 +145,12 @@ class DeviceClock:
         return host - device - expected
 
     def observe(self, device_ns: ArrayLike, host_ns: ArrayLike) -> list[ClockJump]:
-        """Update the conversion with packets, and return the jumps of the clock."""
+        """Update the conversion with packets, and return the jumps of the clock.
+
+        Args:
+            device_ns, host_ns: the times of the packets by the sensor's clock, and their arrival
+                times; int64 ns, shape (n,) or one number each.
+        """
         jumps = []
         device = np.atleast_1d(np.asarray(device_ns, np.int64))
         delays = np.asarray(host_ns, np.int64) - device

@@ -10,7 +10,9 @@ from lidarspec.spec.timing import DAY_S
 
 
 class FindingType(NamedTuple):
-    """The text and the advice of one kind of finding, with names in braces to fill in.
+    """The text and the advice for one kind of finding.
+
+    Names in braces are replaced by attributes of `ClockFinding`.
 
     Attributes:
         text: what was found.

@@ -1,9 +1,9 @@
 """Find lost, late and duplicate datagrams by their clock, if they have no counter.
 
 `ClockOrder` compares each datagram with the newest packets. A datagram is a duplicate if a stored
-packet has the same time and the same bytes. Each packet gets an index, a sequence number with gaps
-for missing packets, and an order, by which `Reorder` sorts the packets. The order is the time since
-the first packet in nanoseconds.
+packet has the same time and the same bytes. Each packet gets an index and an order. The index is a
+sequence number with gaps for missing packets. The order is the time since the first packet in
+nanoseconds, by which `Reorder` sorts the packets.
 
 If the pace of the clock is not declared, lost packets are not found, and the index has no gaps.
 """

@@ -162,11 +162,11 @@ class ClockEpoch:
         return self._find_nearest_time(reference.reading_ns, reference.reported_s) - time - passed
 
     def _find_nearest_time(self, reading: int, seconds: float) -> int:
-        """Return the time nearest to a date at which the clock shows a reading, in ns.
+        """Return the time at which the clock shows a reading, ns since 1970.
 
         Args:
             reading: the reading, ns.
-            seconds: the date, seconds since 1970.
+            seconds: the approximate date, seconds since 1970.
         """
         return reading + round((round(seconds * 1e9) - reading) / self._period_ns) * self._period_ns
 
@@ -342,9 +342,11 @@ def clock_terms(
 ) -> list[tuple[str, Any, Any, int]]:
     """Return (path, step, zero, limit) of the fields that add up to a clock.
 
-    `step` is the ns per raw step, and `zero` is the ns at the raw value 0. They are integers or
-    fractions. `limit` is the largest raw value that can be converted with int64; it is 0 for
-    fractions.
+    Returns:
+        path: the path of the field.
+        step: the ns per raw step, an integer or a fraction.
+        zero: the ns at the raw value 0, an integer or a fraction.
+        limit: the largest raw value that int64 arithmetic can convert; 0 for fractions.
 
     Raises:
         SpecError: if a field has no unit of time, or does not have one value in each packet.
@@ -372,7 +374,7 @@ def clock_terms(
 
 
 def _find_scaling(unit: str, scale: float, offset: float) -> tuple[Any, Any] | None:
-    """Return the ns per raw step and the ns at raw 0; None for other units than time."""
+    """Return the ns per raw step and the ns at raw 0; None if the unit is not a time."""
     per_unit = factor(unit, "s")
     if per_unit is None:
         return None
@@ -386,7 +388,7 @@ def _compute_steps(values: NDArray[np.int64], before: int) -> NDArray[np.int64]:
     """Return the difference of each value from the previous value, (n,).
 
     Args:
-        before: the previous value of the first value.
+        before: the value before the first.
     """
     steps = np.empty(len(values), np.int64)
     steps[0] = values[0] - before

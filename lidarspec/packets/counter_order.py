@@ -290,11 +290,12 @@ class CounterOrder:
         return self._correct(number, time, pace, by_clock)
 
     def _count_by_number(self, ahead: int, period: int) -> int | None:
-        """Return how many places a packet is ahead; None if the sensor has restarted.
+        """Return how many places a packet is ahead of the newest, by the counter alone.
 
         Args:
             ahead: the counter minus the newest packet's counter, modulo `period`.
         """
+        # The result is None if the sensor has restarted.
         if ahead == 0:
             return 0
         behind = period - ahead

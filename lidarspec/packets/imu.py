@@ -143,7 +143,7 @@ class WaitingSamples:
             self._parts.append(more)
 
     def keep_newest(self, most: int) -> None:
-        """Drop all but the newest `most` samples if more than twice as many are stored."""
+        """Drop old samples to limit memory, but keep the newest `most`."""
         if sum(map(len, self._parts)) > 2 * most:
             self._parts = [join_samples(self._parts)[-most:]]
 

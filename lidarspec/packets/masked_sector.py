@@ -46,7 +46,13 @@ VARYING_PACKETS = 2
 
 @dataclass(frozen=True)
 class Sector:
-    """A sector of a revolution."""
+    """A sector of a revolution.
+
+    Attributes:
+        start: the angle at which the sector begins, in turns.
+        width: the width of the sector, in turns.
+        direction: 1 if angles grow as the sensor rotates, else -1.
+    """
 
     start: float
     width: float

@@ -382,7 +382,13 @@ def read_imu(packets: Packets) -> ImuSamples:
 
 @dataclass(frozen=True, eq=False)
 class OwnFrames:
-    """The frames of one type in a piece of input."""
+    """The frames of one type in a piece of input.
+
+    Attributes:
+        frames: the frames of the type.
+        piece: all frames of the piece.
+        rows: the indices of `frames` in `piece`; a slice if they are consecutive.
+    """
 
     frames: Frames
     piece: Frames
