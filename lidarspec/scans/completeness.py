@@ -104,7 +104,16 @@ class PacketCounts:
 
 
 class OpenScan(NamedTuple):
-    """The counts of a scan that has not ended."""
+    """The counts of a scan that has not ended.
+
+    Attributes:
+        has_start: whether the start of the scan has arrived.
+        since: the time of the first packet of the scan, ns.
+        packets: the number of packets of the scan.
+        size: the size of the scan, in bytes or in points.
+        lost: the number of packets missing in the scan.
+        is_broken: whether an unknown number of packets is missing in the scan.
+    """
 
     has_start: bool = False
     since: int = 0

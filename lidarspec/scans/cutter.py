@@ -1,6 +1,7 @@
 """Decide where the scans of a stream end, and whether each of them is complete.
 
-A scan ends at the end that the sensor's rule finds (`scan_ends`), or at its limits (`limits`).
+A scan ends where the sensor's rule finds an end (`scan_ends`), or when it reaches its limits
+(`limits`).
 """
 
 from __future__ import annotations

@@ -16,7 +16,23 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class LaserScan:
-    """A planar scan with the attributes of the ROS message LaserScan."""
+    """A planar scan with the attributes of the ROS message LaserScan.
+
+    Attributes:
+        ranges: (n,) float32 metres; `ranges[i]` is the nearest return at the angle ``angle_min + i
+            * angle_increment``, inf without a return.
+        intensities: (n,) float32, 0 without a return.
+        angle_min: the first angle, radians, counter-clockwise.
+        angle_max: the last angle, ``angle_min + (n - 1) * angle_increment``.
+        angle_increment: the step between angles, radians.
+        time_increment: seconds from beam to beam; negative if the angle decreases with time.
+        scan_time: seconds from scan to scan.
+        range_min: the lowest range that the sensor measures, metres.
+        range_max: the greatest range that the sensor measures, metres.
+        stamp_ns: the time at which `ranges[0]` was measured; `ranges[i]` was measured ``i *
+            time_increment`` later.
+        host_ns: the arrival time of the first packet, as in `Scan`.
+    """
 
     angle_min: float
     angle_max: float

@@ -81,8 +81,8 @@ class ScanLimits:
             usual: the number of packets of a whole scan.
 
         Returns:
-            The row of this packet, or None; and whether the limit applies to all scans, not only to
-                scans with missing packets.
+            The row of this packet, or None; and True for a limit of all scans, False for the limit
+                of scans with missing packets.
         """
         since = scan.since if scan.packets else packets.times.item(0)
         is_overdue = np.abs(packets.times - since) > self.longest_ns

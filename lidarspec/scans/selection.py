@@ -102,7 +102,7 @@ class Selection:
 
     @property
     def is_counted(self) -> bool:
-        """Whether scans are selected by index, time or step, and have to be counted."""
+        """Whether scans are counted, to select them by index, time or step."""
         return self.is_timed or self.scans != (0, None) or self.every != 1
 
     @property
@@ -133,7 +133,13 @@ EVERYTHING = Selection()
 
 
 class TimeSlice:
-    """The selected times of one stream."""
+    """The selected times of one stream.
+
+    Attributes:
+        first: the first time of the stream, ns; None before it is known.
+        last: the newest time of the stream, ns; None before it is known.
+        ended: whether the end of the slice has passed, so that no later time is selected.
+    """
 
     def __init__(self, times: Times) -> None:
         self._times = times

@@ -30,7 +30,12 @@ from lidarspec.spec.sensor import SensorDescription
 
 
 class ScanStart(NamedTuple):
-    """The start of a scan."""
+    """The start of a scan.
+
+    Attributes:
+        time_ns: the time of the first point of the scan, ns.
+        host_ns: the arrival time of the packet with the first point, ns; 0 if unknown.
+    """
 
     time_ns: int
     host_ns: int
