@@ -33,7 +33,13 @@ _LINEAR = (
 
 @dataclass(frozen=True)
 class Scale:
-    """A colour scale in OKLab."""
+    """A colour scale in OKLab.
+
+    Attributes:
+        lightness: the first and the last lightness, from 0 to 1.
+        hue: the first and the last hue, degrees.
+        chroma: the chroma of all colours.
+    """
 
     lightness: tuple[float, float]
     hue: tuple[float, float]

@@ -75,7 +75,14 @@ def mark_invalid(measured: Any, invalid: Any) -> Any:
 def coordinates(
     distance: Any, azimuth: Any, elevation: Any, origin: Sequence[Any]
 ) -> tuple[Any, Any, Any]:
-    """Return x, y and z of points, metres."""
+    """Return x, y and z of points, metres.
+
+    Args:
+        distance: the distance along the beam, metres.
+        azimuth: the azimuth of the beam, radians.
+        elevation: the elevation of the beam, radians.
+        origin: x, y and z of the start of the beam, metres.
+    """
     level: Any = np.cos(elevation)
     sides = [np.cos(azimuth), np.sin(azimuth)]
     if _is_row_lookup(azimuth) or _is_row_lookup(elevation):
@@ -137,7 +144,7 @@ class Grid(NamedTuple):
 
     Attributes:
         rows: the number of directions in a column; 0 if the points are not organised.
-        returns: the number of returns of each direction; they are adjacent.
+        returns: the number of adjacent returns of each direction.
     """
 
     rows: int = 0
@@ -248,7 +255,11 @@ def convert_numbers(values: NDArray[Any], dtype: Any) -> NDArray[Any]:
 
 
 def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
-    """Return the (3, 3) matrix from REP-103 coordinates to named axes."""
+    """Return the (3, 3) matrix from REP-103 coordinates to named axes.
+
+    Args:
+        axes: the directions of x, y and z, for example ("forward", "left", "up").
+    """
     matrix = np.zeros((3, 3))
     for row, name in enumerate(axes):
         axis, is_opposite = divmod(DIRECTIONS.index(name), 2)
@@ -275,7 +286,12 @@ def vendor_turn(sensor: SensorDescription) -> NDArray[np.float64] | None:
 
 
 def turn_azimuth(angles: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert azimuths to rotated axes, radians in [-pi, pi]."""
+    """Convert azimuths to rotated axes, radians in [-pi, pi].
+
+    Args:
+        angles: the azimuths, radians.
+        turn: the (3, 3) rotation matrix.
+    """
     direction = turn[:2, :2] @ np.stack([np.cos(angles), np.sin(angles)])
     return np.asarray(np.arctan2(direction[1], direction[0]))
 

@@ -126,7 +126,7 @@ class GroupPoints:
             stop: the index after the last packet; None for the end of the group.
 
         Returns:
-            (stop - first, *plan.shape) float64; the type of the field for raw integers in `extra`.
+            (stop - first, *plan.shape), float64 except for raw integers in `extra`.
         """
         stop = len(self) if stop is None else stop
         part = self.plan.parts[name]

@@ -271,7 +271,7 @@ def look_up(table, index):
 
 @njit(forceinline=True)
 def row_at(index, rows):
-    """Return `index`, or the index of the last row, which has nan, if out of range."""
+    """Return `index` if it is in range, else the index of the last row, which is nan."""
     if 0 <= index < rows - 1:
         return np.int64(index)
     return rows - 1

@@ -131,6 +131,8 @@ def _compute_along_rows(
 class _ByteShares:
     """Tables from which the checksum of a frame is computed byte by byte.
 
+    The share of a byte is the change of the checksum that this byte causes.
+
     Attributes:
         seen: the number of frames so far.
         is_suited: whether the checksum can be computed from shares.

@@ -491,7 +491,13 @@ _TYPES = {"float32": "SINGLES", "float64": "DOUBLES", "int64": "INTEGERS"}
 
 @dataclass(frozen=True, eq=False)
 class KernelText:
-    """The text of a kernel, its arguments and its results."""
+    """The text of a kernel, its arguments and its results.
+
+    Attributes:
+        source: the source of a module with the function `kernel`.
+        wanted: the arguments of the kernel.
+        columns: the dtypes of the columns that it fills, by name.
+    """
 
     source: str
     wanted: KernelArguments

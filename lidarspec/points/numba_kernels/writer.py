@@ -107,7 +107,14 @@ def write_integer(leaf: Leaf, byte: Any) -> str | None:
 
 @dataclass(frozen=True)
 class LinearTable:
-    """A table with values that are a linear function of the raw value."""
+    """A table with values that are a linear function of the raw value.
+
+    Attributes:
+        slope, start: the coefficients; the value is ``slope * raw + start``.
+        low, high: the lowest and the highest raw value of the linear part; None without a limit.
+        other: the value for all other raw values, nan or inf.
+        exact: whether the arithmetic has to be float64.
+    """
 
     slope: float
     start: float
@@ -195,7 +202,13 @@ class KernelValue:
 
 @dataclass
 class KernelArguments:
-    """The arguments of a kernel in addition to the bytes of the frames."""
+    """The arguments of a kernel in addition to the bytes of the frames.
+
+    Attributes:
+        arrays: arrays that do not depend on data.
+        numbers: lengths and offsets that differ from layout to layout.
+        nodes: the nodes whose values NumPy computes before the kernel is called.
+    """
 
     arrays: list[NDArray[Any]] = field(default_factory=list)
     numbers: list[int] = field(default_factory=list)
