@@ -111,8 +111,7 @@ def take_rows(
 def keep_freed_memory() -> None:
     """Make the allocator keep freed blocks of up to 32 MiB.
 
-    Source: mallopt(3), M_MMAP_THRESHOLD: the threshold is adjusted dynamically, and
-    M_TRIM_THRESHOLD to twice its value.
+    Source: mallopt(3), M_MMAP_THRESHOLD.
     """
     # By default, glibc requests each column of a batch from the system, and the page faults take
     # several times as long as computing the column. glibc keeps blocks that are smaller than the

@@ -68,7 +68,7 @@ def _check(node: tree.Node, path: str, *, is_in_array: bool) -> None:
 
 
 def _check_alternatives(node: tree.When | tree.Select) -> None:
-    """Check that alternatives do not share the name of a part of measured size."""
+    """Check that the cases of an If or Switch have no conflicting names."""
     # `build` finds the value of such a part by its name, before it selects an alternative.
     alternatives = tree.children(node)
     for alternative in alternatives:
@@ -136,7 +136,7 @@ def _check_columns(root: tree.Node) -> None:
 
 
 def check_control(info: tree.FieldInfo) -> None:
-    """Raise `NotCompilableError` if a layout cannot depend on a field."""
+    """Raise `NotCompilableError` for a field that a layout cannot depend on."""
     if info.kind == "int" and info.axes and info.axes[-1].strip("[]") != info.path:
         raise NotCompilableError(
             info.path,

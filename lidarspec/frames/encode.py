@@ -620,7 +620,7 @@ def list_paths(root: Node) -> frozenset[str]:
 
 
 def read_given_value(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str) -> Any:
-    """Return a given value of a frame for a formula (see `lidarspec.spec.tree.Read`).
+    """Return the given value of a field for a formula (see `spec.tree.Read`).
 
     Raises:
         LookupError: if the value is missing.

@@ -72,7 +72,6 @@ class LayoutRows:
     """Frames of one layout.
 
     Attributes:
-        layout: the layout of the frames.
         where: the indices of the frames in the table that contains them, (k,).
         rows: the bytes of the frames, one frame per row, (k, layout.size).
     """
@@ -370,7 +369,7 @@ class _Elements:
     counts: NDArray[np.intp]
 
     def store(self, column: NDArray[Any], values: NDArray[Any]) -> None:
-        """Store the values of the elements in a padded column of the frames."""
+        """Store the values of the elements in a padded column."""
         inner = (slice(0, length) for length in values.shape[1:])
         corner: Any = (self.owners, self.ranks, *inner)
         column[corner] = values
@@ -381,7 +380,6 @@ class _PartRows:
     """Parts of one layout, in any frames.
 
     Attributes:
-        layout: the layout of the parts.
         buffer: the bytes that contain the parts.
         offsets: the offsets of the parts in the buffer, (k,).
         frames: the indices of the frames that contain the parts, (k,).

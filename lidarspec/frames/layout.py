@@ -101,7 +101,6 @@ class Leaf:
     """The position of one field.
 
     Attributes:
-        info: the field.
         offset: the offset of the first element, in bytes from the start of the frame.
         shape: the number of elements along each array that contains the field.
         strides: the distance from one element to the next along each array, in bytes. An array
@@ -344,7 +343,6 @@ class Derivation:
     """A value without bytes of its own, in frames of one layout.
 
     Attributes:
-        info: the value as a field.
         shape: the number of elements along each array that contains the value.
         strides: the difference between the values of consecutive elements along each array.
         formula: a formula of fields of the frame; None if the value is computed from `start`.
@@ -408,7 +406,6 @@ class Seal:
     """A checksum of the frame.
 
     Attributes:
-        algorithm: the algorithm.
         leaves: the fields with the checksum, low bits first.
         spans: the byte ranges that the checksum covers.
         absent: the stored values that mean that the sensor has computed no checksum.
@@ -422,7 +419,7 @@ class Seal:
     end: int = 0
 
     def covers(self, other: Seal) -> bool:
-        """Return whether this checksum covers a field with the checksum of another seal."""
+        """Return whether this checksum covers the bytes of another checksum."""
         return any(
             start < leaf.byte_span[1] and leaf.byte_span[0] < end
             for start, end in self.spans
@@ -444,7 +441,7 @@ class Seal:
         return total
 
     def _list_byte_shifts(self, leaf: Leaf) -> NDArray[np.uint64]:
-        """Return how far each byte of a field is shifted in the value, in bits."""
+        """Return the position of each byte in the value of a field, in bits."""
         powers = np.arange(0, leaf.info.bits, 8, dtype=np.uint64)
         if self.algorithm.order == "little":
             return powers
@@ -535,7 +532,7 @@ class Condition:
     @classmethod
     @lru_cache(maxsize=4096)
     def of(cls, what: FieldInfo | Check) -> Condition:
-        """Return the condition of a check, or of the allowed values of a field."""
+        """Return the condition for a check, or for the allowed values of a field."""
         if isinstance(what, FieldInfo):
             return cls((what,), None, what.path)
         fields = tuple(ref.info for ref in refs(what.condition))
@@ -632,8 +629,8 @@ class Layout:
         regions: the `Region` of each sequence of parts (frames within the frame), by path.
         held: the bits of the fields that declare the sizes of parts, as (mask, value) by offset.
         conditions: the conditions that the values of fields have to meet.
-        derived: the `Derivation` of each value without bytes of its own, by path; the `Leaf` of
-            another field if the value is a copy of this field.
+        derived: the `Derivation` of each value without bytes of its own, by path; a `Leaf` for a
+            copy of a field.
         notes: a cache for results that other modules derive from the layout.
     """
 

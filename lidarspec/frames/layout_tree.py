@@ -35,11 +35,7 @@ from lidarspec.spec.description import Frame
 
 
 class UnknownSelectorError(Exception):
-    """The layout depends on a field, or a size, that is not known yet.
-
-    Attributes:
-        leaf: the field or the size.
-    """
+    """The layout depends on a field, or a size, that is not known yet."""
 
     def __init__(self, leaf: Leaf | MeasuredSize) -> None:
         self.leaf = leaf
@@ -572,7 +568,7 @@ class HeaderNode:
         return self.value_classes.to_representative(value)
 
     def child(self, value: int) -> HeaderNode:
-        """Return the child node of a value, and add it if it is missing."""
+        """Return the child node for a value; add the node if it is missing."""
         if value not in self.children:
             assert self.leaf is not None
             self.children[value] = HeaderNode({**self.values, self.leaf.info.path: value}, self)
@@ -667,7 +663,7 @@ class _ValueClasses:
         return self
 
     def to_representative(self, value: int) -> int:
-        """Return the representative of a value."""
+        """Return the value that represents all values with the same layout."""
         if self.keys:
             if value in self.keys:
                 return value

@@ -337,7 +337,7 @@ def _make_reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
 
 
 def _find_leaf(layout: Layout, path: str) -> Leaf:
-    """Return the position of a field; of the original field, if the field is a copy."""
+    """Return the position of a field, or of the field that it copies."""
     leaf = layout.column(path)
     assert isinstance(leaf, Leaf)
     return leaf
@@ -478,7 +478,7 @@ def _apply_adapter(adapter: Adapter, raw: Reader, frame: bytes) -> Sequence[Any]
 
 
 class _LabelCache(dict[int, Any]):
-    """Cache of the values of an Enum, by raw value, with one object for each name."""
+    """Cache of the values of an Enum, by raw value."""
 
     def __init__(self, info: FieldInfo) -> None:
         super().__init__({raw: EnumValue(raw, name) for raw, name in info.labels.items()})

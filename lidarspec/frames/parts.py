@@ -1,7 +1,6 @@
 """Find the parts of many frames (frames within a frame) at once.
 
-The search runs in rounds: each round finds the next part of every frame. The results are offsets in
-a buffer, as for frames.
+The search runs in rounds: each round finds the next part of every frame.
 """
 
 from __future__ import annotations
@@ -74,10 +73,10 @@ class LayoutLookup(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PartKind:
-    """A kind of parts.
+    """The layouts and constants of a kind of parts.
 
     Attributes:
-        layouts: the layouts of its parts.
+        layouts: the layouts of the parts.
         prefix: the constants that all parts of this kind begin with, as (mask, value) by offset.
     """
 
@@ -166,7 +165,6 @@ class Region:
     """The position of the parts in frames of one header variant.
 
     Attributes:
-        node: the parts in the frame tree.
         kinds: the kinds of parts, in the order in which they are tried.
         start: the offset of the first part.
         rule: the rule that determines the last part.
@@ -347,7 +345,7 @@ class _PartWalk:
         self._errors += [refused.error] if refused.error else []
 
     def _check_declared_sizes(self, layout: Layout, which: Offsets) -> Offsets:
-        """Return the frames in which the sizes in the next part agree with its layout."""
+        """Return the frames whose next part declares the sizes that its layout has."""
         if not layout.held:
             return which
         matches = self._match_constants(which, merge_constants(sort_constants(layout.held)))

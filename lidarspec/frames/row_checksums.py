@@ -359,12 +359,11 @@ def _compute_by_position(
 def make_place_tables(
     length: int, start: int, width: int, poly: int, refin: bool
 ) -> tuple[NDArray[Any], NDArray[np.intp], Any]:
-    """Return the contribution of each byte to the final register, by position.
+    """Return tables of the contribution of each byte to the CRC register.
 
     Returns:
-        The table, (256 * length,), with 256 entries for each position; the index at which the
-        entries of each position begin, (length,); and the register after `length` zero bytes from
-        `start`.
+        The table, (256 * length,); the index of the first entry for each position, (length,); the
+        register after `length` zero bytes.
     """
     table = np.array(
         byte_table(width, poly, refin), f"<u{REGISTER_BYTES[width] if width > 8 else 1}"
@@ -517,7 +516,7 @@ def _make_jump_table(power: int, width: int, poly: int, refin: bool) -> NDArray[
 
 
 def _jump(values: NDArray[Any], table: NDArray[Any]) -> NDArray[Any]:
-    """Return registers, (k,) and contiguous, advanced by a jump table."""
+    """Return contiguous registers, (k,), advanced by a jump table."""
     places = values.view(np.uint8).reshape(len(values), -1).T
     return np.asarray(
         np.bitwise_xor.reduce(

@@ -106,8 +106,7 @@ class Schema:
         arrays: the declared length of each array, by path: a number if all frames have the same
             length, else a formula of header fields, or None if only construct can determine it.
         parts: the parts (frames within the frame), by path.
-        inside: the fields of the parts, by their path in the frame. The fields of the elements of
-            an array (`PartSequence.is_array`) are also in `fields`.
+        inside: the fields of the parts, by their path in the frame.
         derived: the values without bytes of their own, by path.
     """
 
@@ -219,7 +218,7 @@ class Schema:
         }
 
     def axis(self, name: str) -> str:
-        """Return the path of an array from its path or its last name.
+        """Return the path of the array with this path or last name.
 
         Raises:
             SpecError: if no array has the name, or several have it.

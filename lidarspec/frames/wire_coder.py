@@ -133,7 +133,7 @@ class FormCoder(Coder):
     Attributes:
         form: the wire form.
         tree: the layouts of the struct.
-        prefix: the bytes before the first number that are the same in all frames, by offset.
+        prefix: the constant bytes before the first number, by offset.
 
     Raises:
         SpecError: if the fields of the struct do not have computable offsets.

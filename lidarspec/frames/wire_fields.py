@@ -67,12 +67,12 @@ class PlacedSeal:
 
     @property
     def path(self) -> str:
-        """The path of the first field with the checksum."""
+        """The path of the field that contains the checksum, or of the first such field."""
         return f"{self.prefix}.{self.seal.leaves[0].info.path}".strip(".")
 
     @property
     def offset(self) -> int:
-        """The offset of the first byte of the first field with the checksum."""
+        """The offset of the first byte of the checksum."""
         return self.start + self.seal.leaves[0].byte_span[0]
 
     @property
