@@ -7,8 +7,7 @@ reading order:
 * `results`: `Frames`, many frames as arrays; `Found`, one frame; `Counters`.
 * `plausibility`: checks many candidates of one layout at once.
 * `variable_lengths`: checks candidates of layouts that differ only in the length of an array.
-* `frame_codec`: the interface of the codec of one frame type, which checks candidates and makes
-  tables of frames.
+* `frame_codec`: the interface of codecs, which check candidates and make tables of frames.
 * `text_frames`: the codec of frames with a wire form.
 * `frame_engine`: the codec of binary frames with layouts.
 * `plain_frames`: the codec of frames without layouts, which construct parses.

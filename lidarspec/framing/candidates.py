@@ -41,8 +41,7 @@ class SearchState:
     """The state of the search that is kept between the pieces of a stream.
 
     Attributes:
-        after: the name of the last frame type that arrived and is named in the `after` of a type;
-            None before the first such frame.
+        after: the name of the frame type that last changed the active types; None at first.
         changed: the stream offset at which the active types last changed.
         run: the name of the weak type of the last accepted run.
         run_end: the stream offset of the end of this run.
@@ -83,7 +82,6 @@ class PieceResult:
 
         Args:
             numbers: the number of candidates with each status.
-            errors: the exceptions that plugin code has raised.
         """
         for reason, number in enumerate(numbers):
             name = COUNTERS_BY_STATUS.get(reason)
@@ -99,7 +97,6 @@ class Framing:
     Args:
         codecs: the codecs of the incoming frame types by name. If several types match at one
             offset, the first one in this order is used.
-        sums: a function that computes checksums; by default the declared algorithms are used.
     """
 
     def __init__(self, codecs: Mapping[str, Codec], sums: Sums | None = None) -> None:
@@ -152,9 +149,9 @@ class Framing:
         return self.names[kind] in self.named and self.names[kind] != mode.after
 
     def find_switching_types(self, mode: SearchState) -> NDArray[np.bool_]:
-        """Return which frame types change the active types, (types + 1,).
+        """Return whether each frame type changes the active types, (types + 1,).
 
-        The index is the type. The last value, for the index -1, is False.
+        The last value is False.
         """
         return np.array([*(self.switches(kind, mode) for kind in range(len(self.names))), False])
 

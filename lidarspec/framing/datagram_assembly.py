@@ -72,7 +72,7 @@ class JoinedMessages:
         at: the arrival time of each message, ns.
         places: the offset of each message in the input.
         dropped: the number of bytes that were dropped before each message, and after the last one.
-        heads: the number of bytes of the fragments that are not payload.
+        heads: the number of bytes in the fragments that are not payload.
     """
 
     buffer: NDArray[np.uint8]

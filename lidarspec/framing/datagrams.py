@@ -3,8 +3,7 @@
 The types are tried in the order of declaration, and the first type that matches is used. A type
 with `after` is tried only while it is active. A frame must be as long as its datagram.
 
-If a message is sent in fragments, they are joined before the type is found
-(`lidarspec.framing.datagram_assembly`).
+Fragments of a message are joined first (`lidarspec.framing.datagram_assembly`).
 """
 
 from __future__ import annotations

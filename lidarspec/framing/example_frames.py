@@ -232,7 +232,6 @@ def draw_frame(
 
     Args:
         drawn: functions that draw the raw values of certain fields, by path.
-        tries: the maximum number of attempts.
 
     Raises:
         SpecError: if all attempts result in invalid frames.

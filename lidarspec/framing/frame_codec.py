@@ -58,12 +58,9 @@ class Codec:
         """Check the candidates at these offsets; return them with layout and status.
 
         Args:
-            buffer: the bytes.
             offsets: the offsets, at which the prefix has to match.
             stops: the end offset of the bytes of each candidate; None if more bytes may follow.
-            kind: the index of this frame type.
             gathered: whether to copy the bytes of candidates to `Frames.rows`.
-            sums: a function that computes checksums; by default the declared algorithms are used.
         """
         raise NotImplementedError
 

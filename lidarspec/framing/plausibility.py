@@ -111,7 +111,6 @@ class CandidateChecker:
         Args:
             rows: the complete candidates, (n, size).
             errors: the list to which errors of the plugin are added.
-            sums: a function that computes checksums; by default the declared algorithms are used.
         """
         status = np.zeros(len(rows), np.uint8)
         self.check_constants(status, rows)
@@ -243,7 +242,6 @@ class StructConditions:
 
     Args:
         plausible: the plausibility function, see `Frame`; None without one.
-        schema: the schema of the frame.
         layout: any layout of the frame, used to trace the function.
     """
 

@@ -114,10 +114,7 @@ def check_rows(
 
 
 def count_leading_matches(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
-    """Return the number of rows at the start that have the constants of a type.
-
-    Constants beyond the end of the rows are not compared. Returns None if no row has the constants.
-    """
+    """Count the first rows that have the constants of a type; None if there are none."""
     constants = tuple(
         word for word in framing.words[kind] if word[0] + word[1].itemsize <= rows.shape[1]
     )

@@ -1,8 +1,7 @@
 """The results of framing: `Frames`, many frames as arrays; `Found`, one frame; `Counters`.
 
-The codec of a frame type checks candidates, the search accepts some of them, and the decoder adds
-their offsets in the input and their arrival times. Each array of `Frames` is made when it is first
-read.
+`Frames` first contains candidates. The search selects the accepted frames, and the decoder adds
+their offsets and arrival times. Each array is made when it is first read.
 """
 
 from __future__ import annotations

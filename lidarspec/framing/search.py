@@ -122,7 +122,6 @@ class _FrameWalk:
         """Accept valid candidates until the piece ends or the active types change.
 
         Args:
-            position: the offset to start from.
             piece: the result for the piece, which is updated.
 
         Returns:
@@ -238,7 +237,7 @@ def count_rejected(
     """Count the rejected candidates outside of accepted frames.
 
     Args:
-        stays: pairs of an offset and the value of `SearchState.after` after this offset.
+        stays: pairs of an offset and the value of `SearchState.after` from this offset on.
     """
     frames = piece.frames
     begins = np.array([begin for begin, _ in stays])

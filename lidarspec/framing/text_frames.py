@@ -83,7 +83,7 @@ class TextCodec(Codec):
     ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
         """Return the size of each frame, and whether the plugin failed for it.
 
-        The size is `NO_END` or `NO_FRAME` if there is none.
+        The size is `NO_END` or `NO_FRAME` for candidates without an end.
         """
         form = self._coder.form
         is_failed = np.zeros(len(offsets), np.bool_)

@@ -51,9 +51,7 @@ class LayoutFamily:
     """A family of layouts, which differ only in the length of an array.
 
     Attributes:
-        number: the number that identifies the family.
-        lengths: the length of the outermost array of each test, in the order of
-            `CandidateChecker.checks`; 0 for a test outside of arrays.
+        lengths: the length of the outermost array of each test; 0 for a test outside of arrays.
     """
 
     number: int
@@ -145,12 +143,7 @@ def _make_test_key(check: Check) -> Hashable:
 class JointChecker:
     """Checks the candidates of the layouts of one family.
 
-    Args:
-        groups: the layouts with their candidates.
-        families: the family of each layout.
-
     Attributes:
-        layouts: the layouts of the groups.
         which: the indices of all candidates, (n,).
         forms: the index of each candidate's layout, (n,).
         is_final: whether all tests are done. If not, valid candidates have to be checked further.
@@ -193,7 +186,6 @@ class JointChecker:
         Args:
             offsets: the offset of each candidate, (k,).
             forms: the index of each candidate's layout, (k,).
-            sums: a function that computes checksums; by default the declared algorithms are used.
         """
         status = np.empty(len(offsets), np.uint8)
         sizes = self._sizes[forms]

@@ -26,11 +26,11 @@ class WeakRuns:
 
     Attributes:
         frames: the n candidates of the type that are valid or incomplete, sorted by offset.
-        following: for each candidate, the row of the next candidate in its run; n if the run ends,
-            n + 1 if more bytes are needed to know, (n + 2,).
+        following: the row of the candidate that follows each candidate in its run, (n + 2,); n at
+            the end of a run, n + 1 if more bytes are needed.
         confirm: the minimum length of a run that is accepted.
-        is_single: whether a frame of the type changes the active types, so that frames have to be
-            accepted one at a time.
+        is_single: whether frames have to be accepted one at a time, because the type changes the
+            active types.
     """
 
     frames: Frames
@@ -48,7 +48,7 @@ class WeakRuns:
 
     @cached_property
     def heads(self) -> Frames:
-        """The candidates at which a run of at least `confirm` begins, or may begin."""
+        """The candidates at which a run of at least `confirm` frames begins or may begin."""
         count = len(self.frames)
         rows = np.arange(count)
         for _ in range(self.confirm - 1):
@@ -78,7 +78,7 @@ class WeakRuns:
 
     @cached_property
     def _jumps(self) -> list[Indices]:
-        """Arrays with the row that is 1, 2, 4, 8 ... frames later in the run of each row."""
+        """Arrays that map each row to the row 1, 2, 4, 8 ... frames later in its run."""
         count = len(self.frames)
         rows = np.arange(count)
         further = self.following[:count]
@@ -108,9 +108,6 @@ def find_runs(
         candidates: the candidates of the type with any status, sorted by offset.
         earlier: the valid and incomplete candidates of types that are declared before this type,
             sorted by offset.
-        confirm: the minimum length of a run that is accepted.
-        is_single: whether a frame of the type changes the active types, so that frames have to be
-            accepted one at a time.
         final: whether no bytes follow, so that incomplete candidates are invalid.
     """
     # The next frame of a run begins directly after the last byte of a frame. If a frame of an
