@@ -43,7 +43,6 @@ class RecordingFile:
     An existing file with the same path is kept until `settle` replaces it.
 
     Args:
-        path: the path of the file.
         size_at: a function that returns the length of a record; None if the file has no records,
             only bytes.
         overwrite: whether an existing file may be replaced.
@@ -280,7 +279,6 @@ class BackgroundWriter:
         """Queue a record for the thread.
 
         Args:
-            record: the bytes of the record.
             size: number of data bytes to add to `bytes`; None for a header or event.
         """
         with self._changed:

@@ -5,20 +5,20 @@ A recording is a sequence of independent records. The first is the header, in JS
     offset  size  of a record, little-endian
     0       4     mark b"\xb5LS\x1e"
     4       1     kind: 0 header, 1 received, 2 sent, 3 event
-    5       1     flags: 1 a datagram, 2 the line was interrupted before it,
-                  4 the line was silent before it
+    5       1     flags: 1 the data is a datagram, 2 the line was interrupted before
+                  the record, 4 the line was silent before the record
     6       1     a, the length of the addresses in bytes
     7       2     n, the length of the data in bytes
-    9       8     arrival time, ns since 1970, signed; the lowest number: unknown
-    17      a     sender, receiver: each a length byte, that many bytes of address,
-                  and, if there are any, the port in 2 bytes
+    9       8     arrival time, ns since 1970, signed; the lowest number if unknown
+    17      a     sender, receiver: for each, the length of the address in 1 byte,
+                  the address, and the port in 2 bytes (no port if the length is 0)
     17+a    n     data
     17+a+n  4     CRC-32 (zlib) of everything before
 
 An event is a JSON object. Its entry "event" is "disconnect", "reconnect", "dropped" or "clock". For
 "dropped", the entry "records" is the number of dropped records. "clock" means that the wall clock
-was set; "ahead_ns" is the wall clock minus the arrival times, which continue without a jump.
-Readers skip unknown kinds of records.
+was set, which does not change the arrival times; "ahead_ns" is the wall clock minus the arrival
+time. Readers skip unknown kinds of records.
 
 A record is used only if its checksum is valid. The reader stops at the first damaged record, or
 continues with the next valid record (`salvage`). If the recording process is killed, the file ends
