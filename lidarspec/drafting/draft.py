@@ -294,7 +294,7 @@ def _find_count(draft: Draft, stream: bytes) -> Draft:
 
 
 def _find_common_bytes(draft: Draft, parts: Sequence[bytes]) -> Draft:
-    """Return the draft with `common_bytes`, and without frames of fewer bytes."""
+    """Return the draft with `common_bytes`, without frames that are shorter."""
     if draft.length is None or not draft.frames:
         return draft
     if draft.length.unit > 1:
@@ -336,7 +336,7 @@ def _varies_enough(match: ChecksumMatch, frames: Sequence[bytes]) -> bool:
 
 
 def _overlaps(place: ChecksumPlace, field: RisingField, length: int) -> bool:
-    """Return whether a checksum and a field overlap in a frame of some length."""
+    """Return whether a checksum and a field overlap in a frame of this length."""
     start = place.start(length)
     return start < field.end and field.offset < start + place.size
 

@@ -284,7 +284,7 @@ def _make_rising_field(draft: Draft, rising: RisingField, container: str = "fram
 
 
 def _find_start_field(draft: Draft, end_field: RisingField) -> RisingField | None:
-    """Return an earlier field that probably has the start value of `end_field`."""
+    """Return the field that is probably the start of the range that `end_field` ends."""
     if end_field.kind == "counter":
         return None
     for field in draft.rising_fields:

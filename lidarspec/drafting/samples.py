@@ -308,7 +308,7 @@ class SampleFrames:
 
     @property
     def is_single(self) -> bool:
-        """Whether there is a single frame, in which a checksum is searched at the end."""
+        """Whether there is only one frame."""
         return len(self) == 1
 
     def measure_variation(self, place: ChecksumPlace) -> float:
