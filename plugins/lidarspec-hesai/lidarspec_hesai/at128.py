@@ -9,9 +9,9 @@ corrections for every two degrees of the mirror.
 The CRCs are probably the same as in packets of a QT128. No captured packet was available, so the
 CRCs are not verified.
 
-Source: HesaiLidar_SDK_2.0 (udp_protocol_v4_3.h, udp4_3_parser.cc: packet, correction file 1.5, jump
-of 10 degrees, axes as in its code; correction files of an AT128E2X); tier4/nebula (times, 1 to 180
-m, three scans in each revolution at 200 rpm). This module interpolates the corrections linearly, as
+Source: HesaiLidar_SDK_2.0 (udp_protocol_v4_3.h, udp4_3_parser.cc: packets, axes, correction files
+of version 1.5, azimuth jump between scans; correction files of an AT128E2X); tier4/nebula (times,
+range limits, 200 revolutions per minute). This module interpolates the corrections linearly, as
 nebula does.
 """
 
@@ -222,7 +222,7 @@ def points(f: Fields, channels: Mirror) -> Polar:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Return the values of simulated packet i, 10 scans a second with single return."""
+    """Return the values of simulated packet i, for 10 scans a second, single return."""
     shot = i * BLOCKS + np.arange(BLOCKS)
     azimuth = (
         TABLE.faces[shot // SIMULATED_SHOTS % len(TABLE.faces)]

@@ -2,8 +2,8 @@
 
 Unlike in a Pandar128E3X, the header contains the number of blocks, the motor speed has steps of 0.1
 rpm, and the packet's time is 1.888 ms after the last shot. The usual number of blocks, the range
-limits and the rotation speed are not public. Simulated packets have 2 blocks, and 10 revolutions a
-second.
+limits and the rotation speed are not public. The simulation has 2 blocks per packet, and 10
+revolutions a second.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc; angle and firing-time files of
 the model).

@@ -1,4 +1,4 @@
-"""Shared by all packets of the family: date, return modes, points of a shot.
+"""The parts that all packets of the family share: date, return modes, points of a shot.
 
 Source: HesaiLidar_SDK_2.0 (year rule, return modes, timing) and tier4/nebula (geometry; it
 reproduces the point clouds that nebula publishes).

@@ -4,9 +4,9 @@ Numbers are little-endian. A previous edition of the C16 sends packets of 1206 b
 same as those of a Velodyne except for their angles. These packets are not supported.
 
 Source: the vendor's ROS driver (Lslidar_ROS2_driver, branch C16_V4.0, lslidar_driver.cpp); the user
-manual of the C32 for the offsets of the device information. The lasers fire at intervals of 3.125
-us, as in the previous edition. This agrees with the steps of 0.36 degrees in a captured packet at
-20 revolutions a second. The last firing of a packet is at the time of the packet, as in the driver.
+manual of the C32 for the offsets of the device information. The firing interval of 3.125 us is that
+of the previous edition, and agrees with the azimuths of a captured packet. The last firing of a
+packet is at the time of the packet, as in the driver.
 
 The clock is read as a date and nanoseconds, which the sensor sends if it is synchronized by GPS.
 The times of PTP and NTP are sent in other units and are not supported. The configuration of the

@@ -105,7 +105,7 @@ def plausible(f: Fields) -> Any:
 
 
 def is_lfcd_plausible(f: Fields) -> Any:
-    """Return whether the start angle is valid, and the speed at most twice the usual speed."""
+    """Return whether the start angle and the speed are possible."""
     return (f.start_angle >= 0) & (f.start_angle < 360) & (f.speed <= 600)
 
 

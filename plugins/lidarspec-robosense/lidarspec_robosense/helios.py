@@ -190,7 +190,7 @@ def sweep_data(i: int, shots: float, lidar_type: int) -> dict[str, Any]:
 
 
 def has_block_pairs(f: Fields) -> Any:
-    """Return whether pairs of blocks have one azimuth, as they do with two returns."""
+    """Return whether both blocks of a pair have the same azimuth, as with two returns."""
     return f.blocks[0].azimuth == f.blocks[1].azimuth
 
 

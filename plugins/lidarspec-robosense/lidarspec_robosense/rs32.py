@@ -1,12 +1,12 @@
 """RoboSense RS-LiDAR-16, RS-LiDAR-32 and RS-Bpearl: rotating lidars of 16 and 32 lasers over UDP.
 
-Their DIFOP packets have the first of the layouts that `rotor` describes.
+The DIFOP packets have the first layout that the module `rotor` describes.
 
 Source: the vendor's rs_driver (decoder_RS16.hpp, decoder_RS32.hpp, decoder_RSBP.hpp and their
 tests: layouts, firing times, optical centre, return modes, time); ros_rslidar (the angles of an
 example unit of each model). This module reads the date of a packet as UTC, but rs_driver reads it
-as the local time of the computer. In rs_driver's test of the RS-LiDAR-16, a comment mentions steps
-of 0.001 degrees for angles, but the result has steps of 0.0001 degrees.
+as the local time of the computer. In rs_driver's test of the RS-LiDAR-16, angles have steps of
+0.0001 degrees.
 
 As in rs_driver, it is assumed that the type in byte 30 is 1 only in packets of an RS-LiDAR-16, and
 2 only in packets of an RS-LiDAR-32. It is also assumed that bytes 31 and 32 identify a Bpearl of

@@ -1,9 +1,9 @@
 """RoboSense RS-Ruby and RS-Ruby Plus: rotating lidars of 48 to 128 lasers over UDP.
 
-The RS-Ruby models are RS-LiDAR-128, -80 and -48. The RS-Ruby Plus models have 128, 80, 80 (80V) or
-48 lasers. Both series send the same packets, which have 3, 4 or 8 blocks; a block contains all
-lasers. With dual return, a shot has two blocks, so a packet of three blocks contains one and a half
-shots: A A B, and the next packet B C C.
+The RS-Ruby models are RS-LiDAR-128, -80 and -48. The RS-Ruby Plus models have 128, 80 or 48 lasers;
+there are two models with 80 lasers, 80 and 80V. Both series send the same packets, which have 3, 4
+or 8 blocks; a block contains all lasers. With dual return, a shot has two blocks, so a packet of
+three blocks contains one and a half shots: A A B, and the next packet B C C.
 
 Source: RS-Ruby Plus user manual, Table 5-2 to 5-5 (header, return modes, blocks), RS-Ruby user
 manual, Table 4; the vendor's rs_driver (decoder_RS128.hpp, decoder_RS80.hpp, decoder_RS48.hpp and

@@ -160,7 +160,7 @@ class LidarNode(LifecycleNode):
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop and close the sensor, and end."""
+        """Stop and close the sensor, and end the node."""
         self.close()
         self.ended.set()
         return super().on_shutdown(state)
@@ -373,7 +373,7 @@ class LidarNode(LifecycleNode):
 
 
 def _predict_scan_end(expected: float, feed: LiveScans) -> float:
-    """Return when to look for the end of the next scan, by `time.monotonic`.
+    """Return the time of the next search for a scan's end, by `time.monotonic`.
 
     Args:
         expected: the time that was returned for the previous scan.

@@ -1,7 +1,7 @@
 """Publish received packets on a topic, and read the packets of a topic.
 
-The SOURCE `ros2:/TOPIC` is the packets of a topic. A node can therefore decode packets that another
-node or `ros2 bag play` publishes, with their original arrival times.
+The SOURCE `ros2:/TOPIC` reads the packets of a topic. A node can therefore decode packets that
+another node or `ros2 bag play` publishes, with their original arrival times.
 """
 
 from __future__ import annotations

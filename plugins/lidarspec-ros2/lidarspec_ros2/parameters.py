@@ -293,7 +293,7 @@ class Settings:
         return find_declared_sensor(self["source"]) if sensor is None else sensor
 
     def _configure_sensor(self) -> Sensor | None:
-        """Return the sensor in the parameters, with its options; None if it is not set."""
+        """Return the sensor in the parameters, with its options; None if unset."""
         options = [option for option in self["options"] if option]
         sensor = configure_sensor(self["sensor"] or None, options, self["calibration"] or None)
         return None if sensor is None else named_sensor(sensor)

@@ -1,6 +1,6 @@
 """Read the parameters in ROS's part of the command line before the node exists.
 
-rclpy passes parameters only to an existing node. Some of them are needed earlier, because the
+rclpy passes parameters only to an existing node. Some parameters are needed earlier, because the
 transports of the middleware are set when the first node is created. This module therefore reads the
 same words and files as rclpy. It ignores everything that it cannot read, because rclpy reads it
 again and reports invalid values.

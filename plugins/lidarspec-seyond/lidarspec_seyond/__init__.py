@@ -180,7 +180,7 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields) -> Polar:
-    """Return the points of blocks of four channels; second returns follow the first."""
+    """Return the points of blocks of four channels, with one or two returns."""
     block = f.blocks
     pixels = f.blocks.pixels
     differences = f.blocks.more

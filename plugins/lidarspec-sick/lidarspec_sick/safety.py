@@ -5,7 +5,7 @@ A message is one scan. It is sent in several datagrams, each of which has its of
 Source: the vendor's driver sick_safetyscanners (ParseDatagramHeader, UDPPacketMerger,
 ParseDataHeader, ParseDerivedValues, ParseMeasurementData, ParseTypeCodeData.cpp, DatagramHeader.h,
 SickSafetyscannersRos.cpp). The blocks of a message may be at any offset. This module requires that
-they are in the order of their entries in the header, and that the derived values and the
+the blocks are in the order of their entries in the header, and that the derived values and the
 measurements are sent. It does not decode the content of the blocks for the system state, intrusions
 and applications. The commands of CoLa 2, with which a program selects its address and the blocks,
 are not supported. The port is assumed.

@@ -102,7 +102,7 @@ def make_channel(
 
 
 def make_optional(name: str, *parts: Construct) -> tuple[Construct, Construct]:
-    """Return a flag and the fields that are present if it is 1."""
+    """Return a flag and the fields that are present if the flag is 1."""
     return f"has_{name}" / Int16ub, name / If(this[f"has_{name}"] == 1, Struct(*parts))
 
 

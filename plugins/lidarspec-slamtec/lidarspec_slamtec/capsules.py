@@ -66,7 +66,7 @@ SIMULATED_QUALITY = 47
 
 
 def make_nibbles(sync: int) -> Construct:
-    """Return the struct of a byte with a sync nibble, and below it a checksum nibble."""
+    """Return the struct of a byte with a high sync nibble and a low checksum nibble."""
     return BitStruct("sync" / Const(sync, BitsInteger(4)), "checksum" / BitsInteger(4))
 
 

@@ -9,8 +9,8 @@ Source: TI, "Understanding the Out of Box Demo Data Output" (mmWave industrial t
 which the size of the header is given as 44 bytes, but is 40 bytes according to its own table;
 mmWave SDK 3.5 (mmw_output.h) for the types of parts, dpif_pointcloud.h for points and SNR. It is
 assumed that CPU cycles are those of the R4F at 200 MHz. The longest range is assumed. Heat maps,
-and parts of other demos of the toolbox, are kept as bytes. To configure and start the radar, send
-it the lines of a .cfg file over its other UART at 115 200 baud; this plugin does not.
+and parts of other demos of the toolbox, are kept as bytes. This plugin does not configure and start
+the radar: send the lines of a .cfg file to the other UART of the radar, at 115 200 baud.
 """
 
 from __future__ import annotations

@@ -269,7 +269,7 @@ WIRE_OTHER = replace(SENTENCE, joined=1, rest=True)
 
 
 def is_date(f: Fields) -> Any:
-    """Return whether date and time are possible, even before they are known."""
+    """Return whether date and time have possible values."""
     return (f.month <= 12) & (f.day <= 31) & (f.hour < 24) & (f.minute < 60) & (f.second <= 60)
 
 

@@ -6,12 +6,12 @@ in db.xml), which cite the vendor's manuals. Blocks with 0xFFEE contain lasers 1
 with 0xFFDD lasers 33 to 64 of the same firing. With dual return, four consecutive blocks have the
 same azimuth (velodyne_decoder); the first two contain the strongest return.
 
-Each laser of each unit has its own corrections. They are in the unit's file (db.xml), and are also
-sent in `status_value`, one byte in each packet. The corrections in this module are those of an
-example unit. Clouds are marked as nominal until `configure(calibration=...)` reads the unit's file.
-Not supported: the second correction of near distances (below 25 m), intensity by focal distance,
-and the calibration in the status bytes. No captured packet was available. The clock has no date;
-the date is only in the status bytes.
+Each laser of each unit has its own corrections. The corrections are in the unit's file (db.xml),
+and are also sent in `status_value`, one byte in each packet. The corrections in this module are
+those of an example unit. Clouds are marked as nominal until `configure(calibration=...)` reads the
+unit's file. Not supported: the second correction of near distances (below 25 m), intensity by focal
+distance, and the calibration in the status bytes. No captured packet was available. The clock has
+no date; the date is only in the status bytes.
 """
 
 from __future__ import annotations

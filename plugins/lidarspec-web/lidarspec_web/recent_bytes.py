@@ -1,8 +1,8 @@
 """Stores the newest bytes of a source: its frames, and damaged bytes.
 
 A decoder passes its input, and the frames that it has found, to `RecentBytes` (a
-`DecoderObserver`). Both are stored unchanged, up to a limit, so that reading is not slowed down.
-The bytes of a frame are copied only on request.
+`DecoderObserver`). The input and the frames are stored unchanged, up to a limit, so that reading is
+not slowed down. The bytes of a frame are copied only on request.
 """
 
 from __future__ import annotations

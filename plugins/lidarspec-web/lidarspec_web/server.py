@@ -46,7 +46,7 @@ MAX_NUMBER_DIGITS = 12
 
 
 class PageSite:
-    """Serves the page of a broadcast while its context lasts.
+    """Context manager that serves the page of a broadcast.
 
     Args:
         port: port to listen on; 0 for any free port.

@@ -19,7 +19,7 @@ from lidarspec_web.server import PageSite
 
 
 class SourceServer:
-    """Serves the page of a source while its context lasts, and then closes the source.
+    """Context manager that serves the page of a source, and then closes the source.
 
     Args:
         source: port, socket, file or ``sim:`` URL.

@@ -143,7 +143,7 @@ class Viewer:
                 self._send({"is": "ended", "text": self._ending})
 
     def _send_scan(self, broadcast: Broadcast, answers: PageMessages) -> None:
-        """Send the newest scan; before it, send `hello` and the state if they are due."""
+        """Send `hello` and the state if they are due, and then the newest scan."""
         shown = broadcast.shown
         if shown is None:
             return
