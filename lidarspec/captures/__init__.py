@@ -1,9 +1,7 @@
 """Read and write captures: pcap and pcapng files.
 
 A capture is read from a file or a pipe. The readers return UDP datagrams with times and addresses,
-singly or in batches. For the capture of a byte stream, they return its chunks. Packets without a
-datagram are counted. If the first four bytes are those of a capture, no content raises an
-exception. Modules in reading order:
+or the chunks of a captured byte stream. Modules in reading order:
 
 * `source`: a buffered reader of a file or pipe; callers can use its buffers without a copy.
 * `records`: the records of both file formats, and the layout of similar records.

@@ -2,12 +2,10 @@
 
 A batch has arrays of offsets, times and senders.
 
-The records of a device differ in their payloads and times, but hardly in their other bytes.
-`CaptureBatches` therefore parses only one record of each kind, as `CaptureReader` does. The result
-applies to all records of the same length with the same header bytes, except for bytes that may vary
-(see `RecordLayout` and `Headers`). `find_records` returns the offsets of the records in a buffer,
-and `RecordKind.find` selects all records of a kind. All other records are read singly. Datagrams,
-their order and the statistics are the same as those of `CaptureReader` for any file.
+Most records of one sensor differ only in their payload and time. `CaptureBatches` therefore parses
+one of these records, and `RecordKind.find` selects the others by comparing their header bytes. All
+other records are parsed one at a time. The datagrams and the statistics are the same as those of
+`CaptureReader`.
 """
 
 from __future__ import annotations
@@ -51,18 +49,15 @@ MAX_KINDS = 16
 
 @dataclass(frozen=True, eq=False)
 class RecordKind:
-    """The common properties of records that carry datagrams of one sender and size.
+    """The common properties of records with datagrams of one sender and size.
 
     Attributes:
-        length: length of the record, bytes.
         start: offset of the payload in the record.
         size: length of the payload, bytes.
         source: address and port of the sender.
-        times: the encoding of the time.
-        value: the first bytes of a record, as words.
+        value: the first bytes of a record, as 64-bit words.
         mask: the bits of `value` that are equal in all records of the kind.
-        trailer: the NumPy type of the last word of the record, which repeats the length; None for
-            records without this word.
+        trailer: the NumPy type of the last word of the record; None for records without this word.
     """
 
     length: int
@@ -82,11 +77,10 @@ class RecordKind:
         Args:
             storage: the buffer, with at least `MAX_HEADER_BYTES` after each start.
             starts: offsets of the records, (n,).
-            lengths: lengths of the records, (n,) bytes.
 
         Returns:
-            A mask, (n,) bool, or None if all records are of this kind; and the times of the records
-            of this kind, ns.
+            A mask, (n,) bool, or None if all records are of this kind; and the times of the
+            selected records, ns.
         """
         same = lengths == self.length
         if not same.all():
@@ -125,13 +119,7 @@ class RecordKind:
 
 
 def make_record_kind(record: bytes, datagram: Datagram, form: Form) -> RecordKind | None:
-    """Return the kind of a record; None if its first bytes do not determine the kind.
-
-    Args:
-        record: all bytes of the record.
-        datagram: the datagram in the record.
-        form: the reader for the file that contains the record.
-    """
+    """Return the kind of a record; None if its first bytes do not determine the kind."""
     headers = datagram.headers
     pattern = form.find_layout(record)
     if headers is None or pattern is None:
@@ -167,8 +155,8 @@ def find_records(
     """Return the offsets of the complete records between `start` and `stop`.
 
     Returns:
-        The start of each record, followed by the end of the last record; and whether the next
-        record must be read by `form.read`.
+        The start of each record, followed by the end of the last record; and whether `form.read`
+        must read the next record.
     """
     pieces: list[Indices] = []
     single: list[int] = []
@@ -223,13 +211,12 @@ class CapturedDatagrams:
     """A batch of n datagrams in the order of their arrival.
 
     Attributes:
-        buffer: an array that contains the payloads. Later batches overwrite it unless the array, or
-            a view of it, is still referenced.
+        buffer: an array that contains the payloads. Later batches overwrite it, unless the array or
+            a view of it is still in use.
         starts: (n,) offset of each payload in the buffer.
         sizes: (n,) length of each payload, bytes.
         at: (n,) int64 arrival times, ns since 1970; -1 if unknown.
         senders: (n,) indices into `names`.
-        names: address and port of each sender.
         gap: whether datagrams before this batch were skipped.
     """
 
@@ -291,10 +278,7 @@ class CapturedDatagrams:
             start = stop
 
     def iter_frame_senders(self, frames: Frames) -> Iterator[tuple[str, Sender]]:
-        """Yield (frame type, sender) of the frames that were found in these datagrams.
-
-        A type is yielded again each time its sender changes.
-        """
+        """Yield (frame type, sender) of the frames that were found in these datagrams."""
         if len(self.names) == 1:
             yield from (
                 (frames.names[kind], self.names[0])
@@ -314,8 +298,7 @@ class CapturedDatagrams:
 class CaptureBatches(CaptureReader):
     """Reads the datagrams of a capture in batches of arrays.
 
-    Iterating over a reader yields single datagrams, like `CaptureReader`. Use either iteration or
-    `batches`, not both.
+    To read single datagrams, iterate over the reader. Use either iteration or `batches`, not both.
     """
 
     largest = MAX_BUFFER_BYTES
@@ -466,15 +449,7 @@ class _RecordBlock:
         matched: Indices,
         names: dict[Sender, int],
     ) -> NDArray[np.uint8]:
-        """Append the datagrams that were read singly, and return the new buffer.
-
-        Args:
-            buffer: the bytes that contain the payloads of the datagrams in `columns`.
-            columns: arrays with a row for each datagram. This method inserts rows, so that the rows
-                are in the order of the records.
-            matched: the index of the record of each row.
-            names: sender -> index. New senders are added.
-        """
+        """Insert the datagrams that were read one at a time; return the new buffer."""
         data = b"".join(datagram.data for datagram in self._singles.values())
         at = len(buffer)
         rows = []
@@ -512,15 +487,7 @@ class _RecordBlock:
                 self._matched_singles += 1
 
     def _match(self, kind: int, since: int = 0) -> bool:
-        """Compare records with a kind, and assign the kind to the records that match.
-
-        Args:
-            kind: the index of the kind in `_known`.
-            since: the index of the first record to compare. All earlier records were read singly.
-
-        Returns:
-            Whether all records have a kind.
-        """
+        """Assign a kind to matching records; return whether all records have a kind."""
         template = self._known[kind]
         number = len(self._kinds)
         if kind == since == 0 and self._are_whole:

@@ -1,11 +1,8 @@
 """Detect the kind of a file by its first bytes, and decompress it.
 
-Files that cannot contain raw sensor data are refused. The message names the kind of the file.
-
-A file is decompressed while it is read (`UnpackedFile`), never as a whole. If its bytes are
-truncated or damaged, the content ends there, and `find_damage` returns the reason. The data before
-the damage is read, except for at most `STEP_BYTES`, or one block of bzip2. A zip archive can be
-read only from a file, not from a pipe, because its list of files is at its end.
+Files without raw sensor data are refused. Files are decompressed while they are read. If a
+compressed file is damaged, the content ends at the damage, and `find_damage` returns the reason. A
+zip archive must be a file, not a pipe.
 """
 
 from __future__ import annotations
@@ -43,7 +40,6 @@ class Packing(NamedTuple):
     """A compression format.
 
     Attributes:
-        name: name of the format.
         module: name of the Python module with the function `open` that decompresses.
         command: a shell command that decompresses a file; {} stands for the file.
     """
@@ -104,7 +100,6 @@ class Damage(NamedTuple):
     """The reason why decompression ended early.
 
     Attributes:
-        text: message for the user.
         unread: number of compressed bytes that were not read.
     """
 
@@ -116,9 +111,7 @@ class UnpackedFile(io.RawIOBase):
     """The content of a compressed file, decompressed while it is read; not seekable.
 
     Args:
-        name: name of the file, for messages.
-        packed: the compressed file. It is closed with this file, unless it is standard input.
-        file: the decompressor.
+        packed: the compressed file. `close` closes it, unless it is standard input.
 
     Attributes:
         damage: the reason why decompression ended early; None if it did not.
@@ -186,7 +179,7 @@ def find_damage(file: BinaryIO) -> Damage | None:
 
 
 def open_capture(path: str | os.PathLike[str], member: str = "") -> BinaryIO:
-    """Open a file for reading; if it is compressed, decompress it.
+    """Open a file for reading, and decompress a compressed file.
 
     Raises:
         SourceError: if the file cannot be opened or decompressed, or contains no capture.
@@ -200,12 +193,11 @@ def open_capture(path: str | os.PathLike[str], member: str = "") -> BinaryIO:
 
 
 def unpack(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
-    """Return an open file or, if it is compressed, its decompressed content.
+    """Return an open file, or the decompressed content of a compressed file.
 
     Closing the result closes the file.
 
     Args:
-        name: name of the file, for messages.
         member: the file to read from a zip archive; "" for the only capture or recording in it.
 
     Raises:
@@ -260,10 +252,7 @@ def _open_archive_member(name: str, file: BinaryIO, member: str) -> Any:
 
 
 def _choose_member(name: str, archive: zipfile.ZipFile, names: list[str], member: str) -> str:
-    """Return the name of the file to read from a zip archive.
-
-    This is the requested file, the only file, or the only capture or recording.
-    """
+    """Return the requested or the only suitable file of a zip archive."""
     if member:
         if member not in names:
             raise UnknownName(member, names, place=name)
@@ -296,12 +285,10 @@ def refuse_container(path: str, start: bytes) -> None:
     """Raise SourceError if a file is of an unsupported kind.
 
     Args:
-        path: name of the file, for the message.
-        start: its first `HEAD_BYTES`, decompressed.
+        start: the first `HEAD_BYTES` of the file, decompressed.
 
     Raises:
-        SourceError: for an unsupported file. The message names the kind of the file, and the
-            command that extracts the data.
+        SourceError: for an unsupported file.
     """
     for beginning, (kind, command) in _REFUSED.items():
         if re.match(beginning, start, re.DOTALL):

@@ -1,17 +1,16 @@
 """Extract UDP payloads from captured frames, and build frames around payloads.
 
-This module handles link layers, IPv4, IPv6 and fragments, but no files. `parse_ip` returns the IP
-packet in a captured frame. `Reassembly.add` collects the fragments of a packet. `parse_udp` returns
-the UDP header of a whole packet. These functions raise `NoDatagramError`, with the reason, if a
-packet contains no datagram.
+`parse_ip` returns the IP packet in a captured frame. `Reassembly.add` collects the fragments of a
+packet. `parse_udp` returns the UDP header of a whole packet. The functions raise `NoDatagramError`
+for a packet without a datagram.
 
 Two header fields are ignored, because they can be wrong in valid captures:
 
-* Checksums. If the capturing machine sent the packet itself, its network card computes them after
-  the packet was captured.
-* The length of an unfragmented IP packet, if it is 0 or longer than the frame. It is 0 if the
-  network card splits packets, and one lidar model sends the length 1234 in packets of 540 bytes.
-  The length in the UDP header decides whether the payload is complete.
+* Checksums. If the capturing machine itself sent a packet, the packet is captured before the
+  network card computes the checksums.
+* The length of an unfragmented IP packet, if it is 0 or longer than the frame. Network cards that
+  split packets write 0, and one lidar model writes 1234 in packets of 540 bytes. The length in the
+  UDP header is checked instead.
 
 Source: RFC 768 (UDP), RFC 791 (IPv4), RFC 8200 (IPv6), RFC 5722 (overlapping fragments), RFC 6946
 (atomic fragments), IEEE 802.1Q (VLAN tags), and the link-layer header types of tcpdump.org.
@@ -121,9 +120,8 @@ class IpFragment(NamedTuple):
     """The position of a fragment in the whole packet.
 
     Attributes:
-        ident: the identification, which is the same in all fragments of a packet.
+        ident: the identification, which all fragments of a packet share.
         start: offset of the fragment's first byte in the body of the whole packet.
-        more: whether more fragments of the packet follow.
     """
 
     ident: int
@@ -137,10 +135,11 @@ class IpPacket(NamedTuple):
     Attributes:
         source: address of the sender, 4 or 16 bytes.
         destination: address of the receiver, 4 or 16 bytes.
-        protocol: protocol number of the first header in `body`.
+        protocol: protocol number of the first header in `body`: UDP, or an extension header of
+            IPv6.
         body: the bytes after the IP header.
         body_offset: offset of `body` in the frame; 0 for a reassembled packet.
-        fragment: the position of the fragment; None for a whole packet.
+        fragment: None for a whole packet.
         variable_offsets: offsets of the bytes of the IP header that differ between packets.
     """
 
@@ -154,12 +153,7 @@ class IpPacket(NamedTuple):
 
 
 class UdpPacket(NamedTuple):
-    """The header of a UDP packet.
-
-    Attributes:
-        source, destination: the ports.
-        start, stop: the range of the payload in `IpPacket.body`.
-    """
+    """The header of a UDP packet."""
 
     source: int
     destination: int
@@ -171,10 +165,9 @@ class Headers(NamedTuple):
     """The headers before the payload of an unfragmented UDP packet.
 
     Attributes:
-        size: length of all headers together, which is the offset of the payload.
-        payload_size: length of the payload.
-        variable_offsets: offsets of the header bytes that may differ between packets of the same
-            sender and size: checksums and the identification of IPv4.
+        size: length of all headers together, bytes.
+        variable_offsets: offsets of the checksums and of the IPv4 identification. All other header
+            bytes are equal in packets of the same sender and size.
     """
 
     size: int
@@ -186,7 +179,6 @@ def parse_ip(frame: bytes, link: int) -> IpPacket:
     """Return the IP packet in a captured frame, without padding.
 
     Args:
-        frame: the captured bytes, beginning with the header of the link layer.
         link: the link-layer type, as in a pcap header.
 
     Raises:
@@ -227,11 +219,7 @@ def parse_udp(packet: IpPacket) -> UdpPacket:
 
 
 def measure_headers(packet: IpPacket, udp: UdpPacket) -> Headers | None:
-    """Return the sizes of the headers of a UDP packet; None for a reassembled packet.
-
-    Frames of one link type and length have the same sender and the same payload offset if their
-    headers are equal except for the bytes at `variable_offsets`.
-    """
+    """Return the sizes of the headers of a UDP packet; None for a reassembled packet."""
     if not packet.body_offset:
         return None
     size = packet.body_offset + udp.start
@@ -252,8 +240,8 @@ def build_udp_frame(
 
     Args:
         payload: the payload, which has at most `MAX_PAYLOAD_BYTES`, or 20 bytes more over IPv6.
-        source: address and port of the sender.
-        destination: address and port of the receiver. Both addresses have 4 bytes, or both 16.
+        source: address and port of the sender. The address has 4 or 16 bytes.
+        destination: address and port of the receiver. Both addresses have the same length.
     """
     length = _UDP_HEADER.size + len(payload)
     if len(source[0]) == 16:
@@ -300,11 +288,8 @@ def _udp_checksum_over_ipv6(
 
 
 def _internet_checksum(words: bytes) -> int:
-    """Return the complement of the ones' complement sum of 16-bit words.
-
-    The ones' complement sum is the big-endian number of all bytes modulo 0xFFFF, or 0xFFFF if the
-    remainder is 0.
-    """
+    """Return the complement of the ones' complement sum of 16-bit words."""
+    # the sum is the big-endian number of all bytes modulo 0xFFFF, but 0xFFFF instead of 0
     return 0xFFFF - (int.from_bytes(words) % 0xFFFF or 0xFFFF)
 
 
@@ -413,7 +398,7 @@ def _make_fragment(ident: int, *, start: int, size: int, more: bool) -> IpFragme
     """Return the fragment that header fields describe; None for a whole packet.
 
     Raises:
-        NoDatagramError: if no valid packet can have this fragment.
+        NoDatagramError: for contradictory header fields.
     """
     if not more and not start:
         return None
@@ -466,12 +451,11 @@ class _PartialPacket:
 class Reassembly:
     """Reassembles IP fragments that arrive in any order, in bounded memory.
 
-    If fragments of a packet overlap, the packet is dropped (RFC 5722). A repeated fragment is
-    ignored. Incomplete packets are dropped when they are older than `TIMEOUT_NS`. If there are more
-    than `MAX_PACKETS`, or if they have more than `MAX_BYTES` together, the oldest are dropped.
+    A packet with overlapping fragments is dropped (RFC 5722). Incomplete packets are dropped after
+    `TIMEOUT_NS`, or if they exceed `MAX_PACKETS` or `MAX_BYTES`.
 
     Attributes:
-        dropped: the number of fragments of packets that were dropped.
+        dropped: the number of dropped fragments.
     """
 
     MAX_PACKETS = 256
@@ -489,11 +473,9 @@ class Reassembly:
         self._held_bytes = 0
 
     def add(self, packet: IpPacket, fragment: IpFragment, arrival_ns: int) -> IpPacket | None:
-        """Add a fragment; return the whole packet if it is now complete, else None.
+        """Add a fragment; return the whole packet, or None if fragments are missing.
 
         Args:
-            packet: the result of `parse_ip`.
-            fragment: the attribute `fragment` of the packet.
             arrival_ns: the capture time, ns since 1970.
         """
         self._drop_older(arrival_ns - self.TIMEOUT_NS)

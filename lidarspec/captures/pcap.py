@@ -1,9 +1,8 @@
 """Read the UDP datagrams of pcap and pcapng files, and make records of datagrams.
 
 `records` reads the records of a file, and `ip` parses the frames in them. This module combines
-both, and counts packets without a datagram in `CaptureStats`. Captures are untrusted input: if
-the first four bytes are those of a capture, no content raises an exception. The memory use depends
-on the number of bytes in the file, not on length fields.
+both, and counts packets without a datagram in `CaptureStats`. Captures are untrusted input: damage
+in a capture is counted and raises no exception.
 """
 
 from __future__ import annotations
@@ -64,10 +63,8 @@ class Datagram:
     Attributes:
         data: the payload.
         at: capture time in ns since 1970; 0 if the file has no times. For a fragmented datagram,
-            the time of the fragment that completed it.
-        source: address and port of the sender.
-        destination: address and port of the receiver.
-        headers: the sizes of the packet's headers; None if the packet was reassembled or truncated.
+            the time of the last fragment.
+        headers: the sizes of the headers; None if the packet was reassembled or truncated.
     """
 
     data: bytes
@@ -79,26 +76,23 @@ class Datagram:
 
 @dataclass(slots=True)
 class CaptureStats:
-    """The contents of a capture so far.
+    """Counts of the contents of a capture that were read so far.
 
     Attributes:
         packets: number of captured packets of all kinds.
         datagrams: number of UDP datagrams that were returned.
         other: number of packets that are not UDP over IP.
-        others: the number of these packets by protocol, such as "ARP" or "TCP".
-        unsupported: number of packets with an unsupported link layer, by its name, such as
-            "802.11".
-        truncated_tail: whether the file ends within a record. All records before this record were
-            read.
-        snapped: number of UDP packets that were truncated by the snap length of the capture; they
-            are not returned.
+        others: number of packets that are not UDP over IP, by protocol ("ARP", "TCP").
+        unsupported: number of packets with an unsupported link layer, by link layer ("802.11").
+        truncated_tail: whether the file ends within a record.
+        snapped: number of UDP packets that were truncated by the snap length and not returned.
         fragments: number of IP fragments of UDP packets.
         incomplete_fragments: number of fragments of datagrams that stayed incomplete.
-        malformed: number of packets and records with fields that contradict each other.
+        malformed: number of packets and records with contradictory fields.
         damaged: number of records that could not be read.
-        lost: number of bytes that were skipped to find readable records after damaged ones.
-        stopped_at: file offset of the truncated or malformed record that ended the reading; None if
-            the file was read to its end.
+        lost: number of bytes that were skipped because of damaged records.
+        stopped_at: file offset of the record that ended the reading; None if the file was read to
+            its end.
     """
 
     packets: int = 0
@@ -126,10 +120,7 @@ class CaptureStats:
 
 
 def _count_name(counts: Counter[str], name: str) -> None:
-    """Count a name, or "more" if there are already `MAX_COUNTED_KINDS` names.
-
-    The limit keeps a malicious file from using much memory.
-    """
+    """Count a name, or "more" if there are already `MAX_COUNTED_KINDS` names."""
     if name not in counts and len(counts) >= MAX_COUNTED_KINDS:
         name = "more"
     counts[name] += 1
@@ -141,15 +132,14 @@ class CaptureReader(ClosingContext):
     Each datagram is yielded once: a second iterator continues where the first stopped.
 
     Args:
-        file: an open binary file or pipe, which is not closed; or the path of a file, which may be
-            compressed and is closed after the last datagram.
+        file: an open binary file or pipe, which stays open; or the path of a file, which may be
+            compressed.
 
     Attributes:
-        stats: counts of the contents that were read so far.
         largest: maximum number of bytes to read at once.
 
     Raises:
-        SourceError: if the file cannot be read, or is not a capture. Later damage is only counted.
+        SourceError: if the file cannot be read, or is not a capture. Damage is only counted.
     """
 
     largest = MIN_BUFFER_BYTES
@@ -193,7 +183,7 @@ class CaptureReader(ClosingContext):
     def skip_until(self, time_ns: int) -> bool:
         """Skip datagrams that were captured before a time, if the file can seek.
 
-        Skipped datagrams are not counted. A datagram with a skipped fragment is lost.
+        Skipped datagrams are not counted.
 
         Args:
             time_ns: ns since 1970.
@@ -285,10 +275,7 @@ class CaptureReader(ClosingContext):
 
 
 class StreamReader(CaptureReader):
-    """Iterates over the packets of a captured byte stream, as datagrams.
-
-    The link type of the file is USER0 to USER15. Sender and receiver are `UNKNOWN_ENDPOINT`.
-    """
+    """Iterates over the packets of a captured byte stream, as datagrams."""
 
     def to_datagram(self, packet: CapturedPacket | NoPacketReason) -> Datagram | None:
         """Count a packet and return its content; None for another link type."""
@@ -310,7 +297,7 @@ def datagram_record(datagram: Datagram) -> bytes:
     """Return the pcap record of one datagram.
 
     Raises:
-        UsageError: if `datagram_frame` raises it, or for a time outside the range of a record.
+        UsageError: if the payload is too long, or an address, port or time is invalid.
     """
     return packet_record(datagram_frame(datagram), datagram.at)
 
@@ -333,9 +320,7 @@ def datagram_frame(datagram: Datagram) -> bytes:
 
 
 def is_stream_capture(head: bytes) -> bool:
-    """Return whether a file is a capture of a byte stream, by its link type.
-
-    Only little-endian files are recognised.
+    """Return whether a little-endian capture contains a byte stream.
 
     Args:
         head: the first bytes of the file, at least 24 bytes of pcap or 64 bytes of pcapng.
@@ -356,10 +341,7 @@ def is_stream_capture(head: bytes) -> bool:
 
 @lru_cache(maxsize=256)
 def _pack_endpoints(*endpoints: tuple[str, int]) -> list[tuple[bytes, int]]:
-    """Return (address as bytes, port) of each endpoint.
-
-    All addresses have 4 bytes, or all have 16 bytes.
-    """
+    """Return (address as bytes, port) of each endpoint."""
     addresses = []
     for host, port in endpoints:
         try:

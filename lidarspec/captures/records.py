@@ -1,14 +1,10 @@
 """Read and write the records of pcap and pcapng files.
 
 `PcapRecords` and `PcapngBlocks` read one record at a time. They also return the `RecordLayout` of a
-record, by which `bulk` recognizes similar records without reading each of them. `seek_time`
-searches a file by capture time.
+record, with which `bulk` finds similar records. `seek_time` searches a file by capture time.
 
-Malicious input cannot exhaust memory or time: `source` reads in steps of limited size, and each
-iteration of a loop either advances or ends the reading.
-
-An implausible length of a record is accepted unless other records begin within the record. After a
-record that cannot be read, `skip_damage` continues at the next two consecutive records.
+Captures are untrusted: each read has a limited size, and each iteration of a loop advances or ends
+the reading. After a damaged record, `skip_damage` continues at the next two consecutive records.
 
 Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and "PCAP Now Generic
 Capture File Format" (draft-ietf-opsawg-pcapng).
@@ -84,11 +80,8 @@ class CapturedPacket(NamedTuple):
     """A captured frame.
 
     Attributes:
-        link: link-layer type.
         at: capture time in ns since 1970, in the range of int64; 0 if the record has no time.
-        data: the captured bytes.
-        original: length of the packet on the network. It is larger than the length of `data` if the
-            packet was truncated at the snap length.
+        original: length of the packet on the network, before truncation at the snap length.
     """
 
     link: int
@@ -111,15 +104,15 @@ def is_capture(head: bytes) -> bool:
 
 @dataclass(frozen=True)
 class TimeEncoding:
-    """The way in which two words of a record encode a capture time.
+    """The encoding of a capture time in two words of a record.
 
     Attributes:
         word: NumPy type of the words, with the byte order.
         high: index of the first word in the record: seconds, or the upper half of a 64-bit number.
         low: index of the second word in the record: the fraction, or the lower half.
-        ticks: the number of units per second of the fraction, or of the 64-bit number.
+        ticks: units per second of the fraction, or of the 64-bit number.
         is_split: whether the words are seconds and a fraction, instead of a 64-bit number.
-        offset: offset to add to each time, ns.
+        offset: number of ns to add to each time.
     """
 
     word: str
@@ -139,7 +132,7 @@ class TimeEncoding:
         """Return the times of n records, and a mask of the valid times.
 
         Args:
-            heads: the first bytes of each record, (n, size).
+            heads: the first bytes of each record, (n, size), uint8.
 
         Returns:
             Times in ns since 1970, (n,); and a mask of the valid times, (n,), or None if all are
@@ -158,15 +151,13 @@ class TimeEncoding:
 
 
 class RecordLayout(NamedTuple):
-    """The layout of a record with a packet.
+    """The layout of a record that contains a packet.
 
     Attributes:
         head: number of bytes before the packet.
-        time_offsets: offsets of the bytes of the time, which differ between records.
+        time_offsets: offsets of the bytes of the capture time.
         original_offsets: offsets of the bytes of the packet's length on the network.
-        times: the encoding of the time.
-        trailer: NumPy type of the word at the end that repeats the length, with the byte order;
-            None if there is none.
+        trailer: NumPy type of the length that is repeated at the end; None if it is not repeated.
     """
 
     head: int
@@ -180,9 +171,8 @@ class PcapRecords:
     """The records of a pcap file.
 
     Attributes:
-        sections: always 0, because only pcapng files have sections.
+        sections: always 0; only pcapng files have sections.
         order: the byte order of the file, as in `struct`.
-        link: link-layer type of the file.
     """
 
     sections = 0
@@ -203,11 +193,10 @@ class PcapRecords:
         return other
 
     def find_length(self, data: memoryview | bytes, at: int) -> int:
-        """Return the length of the record at an offset; 0 for an implausible length.
+        """Return the length of the record at an offset; 0 if it is implausible.
 
         Args:
             data: a buffer with at least 16 bytes after the offset.
-            at: the offset.
         """
         captured, original = self._lengths.unpack_from(data, at + 8)
         return self._head.size + captured if self._is_plausible(captured, original) else 0
@@ -215,10 +204,7 @@ class PcapRecords:
     def length_field(self, length: int) -> tuple[int, str, int]:
         """Return (offset, NumPy type, value) of the two length fields of a record.
 
-        The two fields are read as one number. The packet must not be truncated.
-
-        Args:
-            length: the length of the record.
+        The two adjacent fields are read as one number. The packet must not be truncated.
         """
         captured: int = length - self._head.size
         return 8, f"{self.order}u8", captured << 32 | captured
@@ -258,8 +244,6 @@ class PcapRecords:
     def find_next_record(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
         """Return the first offset below `stop` at which a record may begin, or None.
 
-        Another record, or the end of the input, must follow the record.
-
         Args:
             is_end: whether the input ends with `data`.
         """
@@ -297,9 +281,7 @@ class PcapRecords:
         return None
 
     def _is_plausible(self, captured: int, original: int) -> bool:
-        """Return whether the lengths of a packet are plausible.
-
-        They are plausible if the packet is whole, or truncated at the snap length.
+        """Return whether a packet is whole, or truncated at the snap length.
 
         Args:
             captured: the length of the packet in the file.
@@ -308,11 +290,8 @@ class PcapRecords:
         return 0 < captured <= MAX_PACKET_BYTES and captured in (original, self._snap_length)
 
     def _has_wrong_length(self, captured: int, original: int) -> bool:
-        """Return whether the length of a record is wrong.
-
-        The length is wrong if another record begins within the packet, but neither a record nor
-        the end of the input follows the packet.
-        """
+        """Return whether the length of a record is wrong."""
+        # the length is wrong if it includes other records, and no record follows the packet
         size = self._head.size + captured
         within = max(captured, min(original, MAX_PACKET_BYTES) + 1)
         data = self._source.peek(self._head.size + within + _REACH_BYTES)
@@ -354,11 +333,7 @@ class PcapngBlocks:
         return other
 
     def find_length(self, data: memoryview | bytes, at: int) -> int:
-        """Return the length of the block at an offset; 0 if `read` must read the block.
-
-        This is the case for the start of a section, for an invalid length, and for a block longer
-        than `MAX_BLOCK_BYTES`.
-        """
+        """Return the length of the block at an offset; 0 if `read` must read the block."""
         kind: int
         length: int
         kind, length = struct.unpack_from(self.order + "II", data, at)
@@ -367,11 +342,7 @@ class PcapngBlocks:
         return length
 
     def length_field(self, length: int) -> tuple[int, str, int]:
-        """Return (offset, NumPy type, value) of the length field of a block.
-
-        Args:
-            length: the length of the block.
-        """
+        """Return (offset, NumPy type, value) of the length field of a block."""
         return 4, f"{self.order}u4", length
 
     def find_layout(self, record: bytes) -> RecordLayout | None:
@@ -388,7 +359,7 @@ class PcapngBlocks:
         """Read the next block and return its packet.
 
         Raises:
-            TruncatedError, DamagedRecordError: if the block at `source.record` cannot be read.
+            TruncatedError, DamagedRecordError: if the next block cannot be read.
         """
         head = bytes(self._source.peek(12))
         if len(head) < 12:
@@ -421,14 +392,11 @@ class PcapngBlocks:
         return NoPacketReason.NO_PACKET
 
     def find_next_record(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
-        """Return the first offset below `stop` at which a block may begin, or None.
-
-        If an interface block was lost, only a section block is found, because the packets of the
-        current section cannot be read.
-        """
+        """Return the first offset below `stop` at which a block may begin, or None."""
         sections = (match.start() for match in re.finditer(re.escape(_SECTION), data[: stop + 3]))
         section = next((at for at in sections if bytes(data[at + 8 : at + 12]) in _ORDERS), None)
         count = len(data) - 11
+        # without all interfaces, the packets of the section cannot be read
         if not self._knows_all or count <= 0:
             return section
         words = np.ndarray((count + 8,), f"{self.order}u4", data, 0, (1,))
@@ -444,12 +412,7 @@ class PcapngBlocks:
         return min([*right[:1], *([section] if section is not None else [])], default=None)
 
     def _has_wrong_length(self, kind: int, length: int) -> bool:
-        """Return whether the length of a block is wrong.
-
-        A length is wrong if it is impossible for the type of the block, or if the last word of the
-        block does not equal the length. If that word is not in the buffer, the length is wrong if
-        another block begins within this block.
-        """
+        """Return whether the length of a block is wrong."""
         if not _is_possible_length(length) or (
             length > MAX_BLOCK_BYTES and kind in _PACKETS | {_INTERFACE}
         ):
@@ -496,9 +459,8 @@ def skip_damage(source: BufferedInput, form: Form) -> bool:
 def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
     """Skip packets that were captured before a time.
 
-    The packets must be in the order of their times. About `NEAR_BYTES` of earlier packets are not
-    skipped. The next section of a pcapng file is not skipped, and neither are packets with a time
-    more than a year from that of the first packet.
+    The packets must be in the order of their times. About `NEAR_BYTES` before the time are not
+    skipped. Skipping ends at the next section of a pcapng file.
 
     Args:
         at: ns since 1970.
@@ -529,10 +491,7 @@ def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
 
 
 def _find_timed_packet(source: BufferedInput, form: Form, stop: int) -> tuple[int, int] | None:
-    """Return the time and the offset of the next packet with a time.
-
-    Returns None if `stop` or the start of another section comes before such a packet.
-    """
+    """Return (time, offset) of the next timed packet that begins before `stop`, or None."""
     section = form.sections
     form = form.reopen(source)
     while skip_damage(source, form) and source.begin_record() and source.record < stop:
@@ -550,10 +509,7 @@ def _find_timed_packet(source: BufferedInput, form: Form, stop: int) -> tuple[in
 
 
 def _is_possible_length(length: int) -> bool:
-    """Return whether a block can have this length.
-
-    The length must be a multiple of 4, and include at least a header and a trailer.
-    """
+    """Return whether a length is a multiple of 4, and includes header and trailer."""
     return length >= 12 and length % 4 == 0
 
 
@@ -581,10 +537,7 @@ def _parse_interface(order: str, body: bytes) -> Interface:
 def _parse_packet_block(
     order: str, kind: int, body: bytes, interfaces: list[Interface]
 ) -> CapturedPacket | None:
-    """Return the packet of a packet block; None if the block is invalid.
-
-    A block is invalid if its lengths contradict each other, or if its interface is unknown.
-    """
+    """Return the packet of a packet block; None if the block is invalid."""
     if kind == _SIMPLE_PACKET:
         if len(body) < 4 or not interfaces:
             return None
@@ -608,7 +561,7 @@ def _parse_packet_block(
 
 
 def capture_head(link: int) -> bytes:
-    """Return the header of a pcap file: little-endian, with nanoseconds.
+    """Return the header of a little-endian pcap file with nanoseconds.
 
     Args:
         link: the link type: `ip.ETHERNET` for datagrams, USER0 for a byte stream.
@@ -620,7 +573,7 @@ def packet_record(data: bytes, at: int) -> bytes:
     """Return the pcap record of one packet.
 
     Args:
-        data: the packet, with the headers that the file's link type requires.
+        data: the packet, with its headers.
         at: capture time, ns since 1970.
 
     Raises:
@@ -643,11 +596,10 @@ def _refuse_size(data: bytes) -> None:
 
 
 def record_size(data: bytes | bytearray, at: int) -> int:
-    """Return the length of the record, or of the file header, at an offset.
+    """Return the length of the record or file header at an offset.
 
     Args:
-        data: a piece of a pcap file, as this module writes it.
-        at: the offset in the piece.
+        data: a piece of a pcap file that this module wrote.
     """
     if at == 0 and is_capture(bytes(data[:4])):
         return _HEAD.size
@@ -658,10 +610,9 @@ class CaptureFormat(NamedTuple):
     """Functions that write captures of one format.
 
     Attributes:
-        head: a function that returns the file header for a link type.
-        record: a function that returns the record for a packet and its time in ns since 1970.
-        size: a function that returns the length of the record or file header at an offset, given a
-            piece of the file and the offset.
+        head: returns the file header for a link type.
+        record: returns the record for a packet and its time in ns since 1970.
+        size: returns the length of the record or file header at an offset of a piece of the file.
     """
 
     head: Callable[[int], bytes]

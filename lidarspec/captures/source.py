@@ -1,11 +1,7 @@
 """Read the bytes of a capture from a file or a pipe.
 
-The size of each read is limited. The size of the buffer depends on the number of bytes that have
-been read, not on length fields of the file, so that a corrupt length cannot cause a large
-allocation.
-
-Callers can use the buffer without a copy: `BufferedInput.view` returns it as a read-only array. The
-buffer is not overwritten while this array, or a view of it, exists.
+Each read has a limited size, so a corrupt length in the file cannot cause a large allocation.
+`BufferedInput.view` returns the buffer as an array without copying it.
 """
 
 from __future__ import annotations
@@ -41,12 +37,12 @@ class BufferedInput:
 
     Args:
         file: the open file or pipe.
-        largest: maximum size of the buffer in bytes. Only a longer record makes the buffer larger.
+        largest: maximum size of the buffer in bytes, except for a longer record.
 
     Attributes:
         storage: the current buffer. Its last `SLACK_BYTES` are never filled.
         at: offset of the next byte in `storage`.
-        record: file offset of the current record, which `begin_record` sets.
+        record: file offset of the current record.
         offset: file offset of the next byte.
     """
 
@@ -77,8 +73,7 @@ class BufferedInput:
     def open_at(self, offset: int) -> BufferedInput:
         """Return a second source of the same file that starts at a file offset.
 
-        Reading the second source moves the position of the file, so call `seek` before using this
-        source again.
+        Before using this source again, call `seek`: both sources share the position of the file.
         """
         return _open_source_at(self._file, MIN_BUFFER_BYTES, offset)
 
@@ -100,10 +95,7 @@ class BufferedInput:
         return size
 
     def peek(self, size: int) -> memoryview:
-        """Return the next `size` bytes without consuming them.
-
-        At the end of the input, returns fewer bytes.
-        """
+        """Return the next `size` bytes without consuming them; fewer at the end."""
         self._fill_buffer(size)
         return self._data[self.at : self.at + size]
 
@@ -148,7 +140,7 @@ class BufferedInput:
     def view(self) -> NDArray[np.uint8]:
         """Return the bytes in the buffer, (n,), uint8, read-only.
 
-        The buffer is not overwritten while this array, or a view of it, exists.
+        The buffer is not overwritten while the array is in use.
         """
         array = np.frombuffer(self._view[: len(self._data)], np.uint8)
         array.flags.writeable = False
@@ -174,10 +166,7 @@ class BufferedInput:
         return have >= size
 
     def _move_unread(self, have: int) -> None:
-        """Move the unread bytes to the start of the buffer, or to another buffer.
-
-        Another buffer is used if the current buffer has a view, or is too small.
-        """
+        """Move the unread bytes to the start of the buffer, or to another buffer."""
         size = len(self.storage) - SLACK_BYTES
         tail = self.storage[self.at : self.at + have]
         at = self.at
@@ -222,11 +211,9 @@ def _open_source_at(file: BinaryIO, largest: int, offset: int) -> BufferedInput:
 
 
 def _get_read_function(file: BinaryIO) -> Callable[[memoryview], int | None]:
-    """Return a function that reads the available bytes into a buffer.
-
-    For a buffered pipe this is `readinto1`, because `readinto` blocks until the buffer is full.
-    """
+    """Return a function that reads the available bytes into a buffer."""
     if isinstance(file, io.BufferedIOBase):
+        # readinto blocks until the buffer is full
         return file.readinto1
     if isinstance(file, io.RawIOBase):
         return file.readinto
