@@ -1,7 +1,7 @@
 """Identify the sensor of a source, and diagnose a source without valid data.
 
 The functions take a SOURCE, or bytes. They return the sensors that may have sent the data, or
-findings, each with the command that fixes the problem. Modules in reading order:
+findings with suggested commands. Modules in reading order:
 
 * `sample_bytes`: the bytes of one sender, from which its sensor is identified.
 * `listen`: reads sample bytes from any source.

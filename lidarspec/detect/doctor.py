@@ -1,6 +1,6 @@
 """Diagnose a source without data, or without valid data.
 
-A finding suggests the command that fixes the problem, unless no command can fix it.
+Most findings suggest a command that fixes the problem.
 """
 
 from __future__ import annotations
@@ -53,8 +53,6 @@ class Diagnosis:
     """The result of one check.
 
     Attributes:
-        ok: whether no problem was found.
-        text: a description of the result.
         fix: the command that fixes the problem; "" if there is no command for it.
         is_silence: whether the problem is that no data was received.
     """
@@ -75,7 +73,6 @@ def examine(
     """Check a source, and yield findings in the order of the checks.
 
     Args:
-        source: the source to check.
         sensor: the expected sensor; None to detect it.
         seconds: the time to listen at each baud rate.
     """
@@ -176,10 +173,7 @@ def _check_permission(port: str) -> Iterator[Diagnosis]:
 
 
 def _make_udev_rule_command(port: str) -> str:
-    """Return a command that adds a udev rule.
-
-    All users may then open this port and ports of the same kind.
-    """
+    """Return a command that adds a udev rule, so that all users may open a port."""
     kind = os.path.basename(port).rstrip("0123456789")
     rule = f'KERNEL=="{kind}[0-9]*", MODE="0666"'
     return f"echo '{rule}' | sudo tee /etc/udev/rules.d/99-lidarspec.rules && sudo udevadm trigger"
@@ -214,10 +208,7 @@ def _examine_udp(
 
 
 def _select_udp_ports(address: SourceAddress, sensor: Sensor | None) -> list[int]:
-    """Return the UDP ports that a SOURCE names.
-
-    If it names none, returns the ports of the sensor, or of all installed sensors.
-    """
+    """Return the UDP ports of a SOURCE, or the ports that the sensors declare."""
     port = address.host_and_port()[1]
     text = address.options.get("port", "")
     if text:
@@ -263,10 +254,9 @@ def _check_buffer() -> Iterator[Diagnosis]:
 def _check_interfaces(
     numbers: list[int], host: str, rates: dict[str, float]
 ) -> Iterator[Diagnosis]:
-    """Yield the possible reasons why no packet arrives at some UDP ports.
+    """Yield the possible reasons why no packet arrives at UDP ports.
 
     Args:
-        numbers: the ports.
         host: the address of this computer in the SOURCE; "" if it has none.
         rates: the received packets per second, by interface.
     """
@@ -340,13 +330,7 @@ def _check_single_sender(source: str, verdicts: Sequence[Verdict]) -> Iterator[D
 
 
 def _diagnose_data(source: str, verdict: Verdict, sensor: Sensor | None) -> Diagnosis:
-    """Return the finding about the data that one sender has sent.
-
-    Args:
-        source: the source, for suggested commands.
-        verdict: the result of the identification.
-        sensor: the expected sensor; None if the user has not named one.
-    """
+    """Return the finding about the data of one sender."""
     sample = verdict.sample
     ids = [score.sensor.id for score in verdict.scores]
     # id of each possible sensor -> evidence

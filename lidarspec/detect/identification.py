@@ -1,16 +1,13 @@
 """Identify the installed sensor that sent some bytes.
 
-`rate_sensors` decodes the bytes with each installed sensor. The score of a sensor is the share of
-the bytes that are in frames with a valid checksum and plausible values. `identify_sample` selects
-the sensor with the best score.
+The bytes are decoded with each installed sensor. `rate_sensors` returns the share of the bytes that
+are in valid frames of a sensor. `identify_sample` selects the sensor with the largest share.
 
-`distinguish` decides between related models with the same frames. It uses packets that only one
-model sends, the clock step per packet, and the model name in a frame, which is a text or a
-documented value ("0x22 NAME"). If this evidence is not sufficient, all related models remain
-possible, including models that are not installed.
+Related models have the same frames. `distinguish` compares packets that only one model sends, the
+clock step per packet, and the model name in a frame. If none of these differs, all related models
+remain possible, including models that are not installed.
 
-For a single frame, `find_fitting_sensors` returns the sensors with a frame type that matches the
-bytes exactly. `find_nearest_fault` returns the error of the sensor that parsed most of the bytes.
+`find_fitting_sensors` and `find_nearest_fault` examine a single frame.
 """
 
 from __future__ import annotations
@@ -86,11 +83,9 @@ class Distinction(NamedTuple):
     """The result of a comparison of related models.
 
     Attributes:
-        candidates: the installed models that may have sent the frames: id -> evidence for this
-            model, or "".
-        others: the models without an installed plugin that may have sent the frames: id ->
-            difference from the installed models. If `candidates` is empty, one of these models has
-            sent the frames.
+        candidates: the installed models that may have sent the frames: id -> evidence, or "".
+        others: the models that are not installed, but may have sent the frames: id -> difference
+            from the installed models.
     """
 
     candidates: dict[str, str]
@@ -98,14 +93,10 @@ class Distinction(NamedTuple):
 
 
 def distinguish(candidates: Sequence[Sensor], frames: Mapping[str, Sequence[Found]]) -> Distinction:
-    """Decide which of several sensors with the same data frames sent some frames.
-
-    The criteria are, in this order: packets that only one model sends, the clock step per packet,
-    and model names.
+    """Decide which of several sensors with equal data frames sent the frames.
 
     Args:
-        candidates: sensors that decode the same data frames.
-        frames: the frames that each candidate decoded, by id, in the order of arrival.
+        frames: id -> frames that this sensor decoded, in the order of arrival.
     """
     ids = {sensor.id for sensor in candidates}
     excluding = {
@@ -158,12 +149,10 @@ def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
 
 
 def _find_excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
-    """Return the related models that must have sent some frames.
-
-    More than half of the packets must have a property that the sensor's own packets never have.
+    """Return related models whose packets differ from the sensor's packets.
 
     Returns:
-        Id of the related model -> the difference between the model and the sensor.
+        Id of the related model -> its difference from the sensor.
     """
     distinct_relatives = {
         name: relative
@@ -182,6 +171,7 @@ def _find_excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[s
     return {
         name: relative.difference
         for name, relative in distinct_relatives.items()
+        # more than half of the packets must have a property that the sensor's packets never have
         if np.mean(np.asarray(relative.sends(fields))) > 0.5
     }
 
@@ -193,14 +183,8 @@ def _keep_matching(
 ) -> dict[str, str]:
     """Return the sensors that one criterion selects, with the evidence.
 
-    Args:
-        candidates: the possible sensors.
-        match: a function that returns the evidence that a sensor matches; "" if it does not match.
-        frames: the frames of each candidate, by id.
-
     Returns:
-        Id of each matching sensor -> evidence. The dict is empty if the criterion cannot decide:
-        if none of the sensors matches, or if all of several sensors match.
+        Id of each matching sensor -> evidence; empty if the criterion cannot decide.
     """
     if len(candidates) == 1 and not candidates[0].relatives:
         return {}
@@ -263,12 +247,7 @@ def _match_clock(sensor: Sensor, frames: Sequence[Found]) -> str:
 
 @functools.lru_cache(maxsize=256)
 def _simulate_pace(sensor_id: str, sensor: Sensor) -> float | None:
-    """Return the clock step per packet of the simulated sensor, ns; None if unknown.
-
-    Args:
-        sensor_id: the id of the sensor, which is part of the key of the cache.
-        sensor: the sensor.
-    """
+    """Return the clock step per packet of the simulated sensor, ns; None if unknown."""
     try:
         steps = np.diff(sensor.decode(simulate(sensor, SIMULATED_PACKETS)).time_ns)
     except LidarSpecError:
@@ -315,8 +294,7 @@ def read_info(sensor: Sensor, frames: Iterable[Found]) -> dict[str, str]:
     """Return the values of the sensor's `info` fields in the last frame of each type.
 
     Returns:
-        Name in `info` -> value as text, for example {"serial": "A1234"}. Numbers are followed by
-        their unit.
+        Name in `info` -> value as text with its unit, for example {"serial": "A1234"}.
     """
     items = sorted(frames, key=lambda item: item.offset)
     texts = dict[str, str]()
@@ -338,14 +316,7 @@ def _reports(sensor: Sensor, fact: Reported, item: Found) -> bool:
 def find_reporting(
     sensor: SensorDescription, fact: Reported, name: str, frames: Frames
 ) -> NDArray[np.bool_]:
-    """Return which frames report a fact, such as the model name, as a mask (n,).
-
-    Args:
-        sensor: the sensor that sent the frames.
-        fact: the fact, which declares the condition that a frame must meet.
-        name: the type of the frames.
-        frames: n frames of this type.
-    """
+    """Return a mask (n,) of the frames that report a fact, such as the model name."""
     if fact.where is None or not len(frames):
         return np.ones(len(frames), np.bool_)
     table = get_codec(sensor.frames[name]).gather(frames)
@@ -377,11 +348,7 @@ def _describe_fact(fact: Reported, value: Any, info: FieldInfo) -> str:
 
 
 def _read_field(sensor: Sensor, item: Found, path: str) -> tuple[Any, FieldInfo]:
-    """Return the raw value and the description of a field.
-
-    If the field is in repeated parts, the value of the first part that has the field is returned.
-    If no part has the field, the value is "".
-    """
+    """Return the raw value and the description of a field; "" if it is missing."""
     fields = make_schema(sensor.frames[item.frame].tree)
     parsed = sensor.parse(item.data, item.frame)
     axis, _, rest = fields.split_part_path(path) or ("", "", path)
@@ -417,11 +384,10 @@ class Score:
     """The rating of a sensor for some bytes.
 
     Attributes:
-        sensor: the sensor.
         share: the share of the bytes that are in frames of the sensor.
         data_frames: number of decoded data frames.
         frames: all decoded frames.
-        evidence: further evidence for this sensor; "" without any.
+        evidence: evidence for this sensor, in addition to its frames; "" if there is none.
     """
 
     sensor: Sensor
@@ -436,14 +402,11 @@ class Verdict:
     """The sensors that may have sent some bytes.
 
     Attributes:
-        sample: the bytes.
         scores: all sensors that fit, best first.
-        candidates: the sensors that remain possible after comparing related models.
-        others: the models without an installed plugin that may have sent the bytes: id ->
-            difference from the installed models. If `candidates` is empty, one of these models has
-            sent the bytes.
-        fault: a message about frames of a sensor that all have wrong checksums; "" if there are no
-            such frames.
+        candidates: the sensors that may have sent the bytes.
+        others: the models that are not installed, but may have sent the bytes: id -> difference
+            from the installed models.
+        fault: a message if frames of a sensor have wrong checksums; else "".
     """
 
     sample: SampleBytes
@@ -469,11 +432,10 @@ class Verdict:
 
 
 def rate_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Score]:
-    """Return the scores of the installed sensors that find a data frame, best first.
+    """Return the scores of the sensors whose data frames are found, best first.
 
     Args:
         chunks: datagrams, or pieces of a stream.
-        datagrams: whether the chunks are datagrams.
     """
     candidates = _list_sensors_with_frames()
     scores = _score_each(candidates, lambda sensor: _score(sensor, chunks, datagrams=datagrams))
@@ -490,11 +452,10 @@ def _list_sensors_with_frames() -> list[Sensor]:
 
 
 def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
-    """Return a message about frames of a sensor that all have wrong checksums.
+    """Return a message about frames of a sensor with wrong checksums.
 
     Returns:
-        The message, with a checksum algorithm that matches, if one is found; "" if there are no
-        such frames.
+        The message; "" if no such frames are found.
     """
     unchecked = _score_each(
         _list_sensors_with_frames(),
@@ -528,10 +489,7 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
 
 
 def _read_stored_checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64]:
-    """Return the checksums in the frames, (n,).
-
-    A decoder that uses this function to compute checksums accepts every checksum.
-    """
+    """Return the checksums in the frames, (n,)."""
     return seal.load_stored(rows)
 
 
@@ -540,12 +498,7 @@ def _score_each(
 ) -> list[Score]:
     """Return the scores of the sensors that fit.
 
-    If several sensors have identical frames, the bytes are decoded only once. A sensor with a
-    faulty description is ignored with a warning.
-
-    Args:
-        candidates: the sensors.
-        rate: a function that returns the score of a sensor; None if the sensor does not fit.
+    A sensor with a faulty description is ignored with a warning.
     """
     shared: dict[object, Score | None] = {}  # key: identity of the frames, and id of the sensor
     for sensor in candidates:
@@ -576,7 +529,7 @@ def _score(
     """Return the score of a sensor; None if the bytes contain no data frame.
 
     Args:
-        sums: a function that computes checksums; None to use the declared algorithms.
+        sums: computes checksums; None for the declared algorithms.
     """
     if sensor.recognise is not None and datagrams and (options := sensor.recognise(tuple(chunks))):
         sensor = sensor.configure(**options)
@@ -597,11 +550,7 @@ def _score(
 
 
 def _score_mid_stream(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score | None:
-    """Return the score of a sensor for bytes that begin in the middle of its data.
-
-    Some data frames are valid only after another frame, such as a reply. They are rated as if this
-    frame had been received. Returns None if the sensor has no such data frames, or if none fits.
-    """
+    """Return the score of a sensor that was already sending; None if it does not fit."""
     names = [name for name in sensor.data_frames if sensor.frames[name].after is not None]
     scores = [_score(sensor.configure(answer=name), chunks, datagrams=datagrams) for name in names]
     return max(
@@ -612,11 +561,7 @@ def _score_mid_stream(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: boo
 
 
 def identify_sample(sample: SampleBytes) -> Verdict:
-    """Identify the sensor that sent some bytes.
-
-    The criteria are, in this order: valid frames, differences between related models, and the baud
-    rate.
-    """
+    """Identify the sensor that sent some bytes."""
     fitting = [
         score
         for score in rate_sensors(sample.chunks, datagrams=sample.datagrams)
@@ -667,10 +612,9 @@ def identify_senders(
 ) -> list[Verdict]:
     """Identify the sensors of a source; return one verdict for each sender.
 
-    For a serial port, returns only the verdict for the baud rate that fits best.
+    For a serial port, returns the verdict for the baud rate that fits best.
 
     Args:
-        source: the source.
         seconds: the time to listen at each baud rate.
         on_progress: a function that is called with a description of the source before each attempt.
 
@@ -700,8 +644,7 @@ def select_best(verdicts: Sequence[Verdict]) -> Verdict:
 def detect(source: str | Path) -> Sensor:
     """Return the installed sensor that sends to a source.
 
-    If the source declares its sensor, for example in the header of a recording, its bytes are not
-    examined.
+    If the source declares its sensor, as a recording does, no bytes are examined.
 
     Raises:
         CommandError: if a live source sends nothing.
@@ -776,7 +719,7 @@ def describe_unsupported_models(verdict: Verdict) -> str:
 def find_declared_sensor(source: str | Path) -> Sensor | None:
     """Return the sensor that a source declares; None if it declares no sensor.
 
-    A device of `lidarspec.toml`, a recording and a simulated source can declare one.
+    Devices in `lidarspec.toml`, recordings and simulations can declare a sensor.
 
     Raises:
         UsageError: for standard input.
@@ -843,7 +786,7 @@ MIN_CONSTANT_BITS = 8
 def find_fitting_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Sensor]:
     """Return the installed sensors that fit some bytes, best first.
 
-    If all bytes together are exactly one frame, returns only the sensors with this frame.
+    If the bytes are exactly one frame, returns only sensors with this frame.
     """
     installed = list(sensors().values())
     data = b"".join(chunks)
@@ -865,7 +808,7 @@ def find_fitting_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Se
 def find_nearest_fault(data: bytes) -> WireError | None:
     """Return the error of the installed sensor that parsed most of an invalid frame.
 
-    Returns None if no sensor has a frame that begins like the bytes.
+    Returns None if no sensor has a frame with such a beginning.
     """
     errors = []
     for sensor in sensors().values():
@@ -883,10 +826,7 @@ def find_nearest_fault(data: bytes) -> WireError | None:
 
 
 def _is_frame(sensor: Sensor, name: str, data: bytes) -> bool:
-    """Return whether the bytes are exactly one valid and plausible frame of a type.
-
-    No bytes are a frame of a type with a faulty description.
-    """
+    """Return whether the bytes are exactly one valid and plausible frame of a type."""
     frame = sensor.frames[name]
     if not 0 < len(data) <= frame.max_length:
         return False
@@ -909,10 +849,7 @@ def _has_prefix(codec: Codec, data: bytes) -> bool:
 
 
 def _begins_like_frame(fault: WireError) -> bool:
-    """Return whether invalid bytes begin with the constant bits of a frame type.
-
-    At least `MIN_CONSTANT_BITS` bits must be equal, so that the match is not a coincidence.
-    """
+    """Return whether invalid bytes begin with the constant bits of a frame type."""
     if not fault.frame:
         return False
     prefix = get_codec(sensors()[fault.sensor].frames[fault.frame]).prefix

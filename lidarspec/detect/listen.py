@@ -1,8 +1,7 @@
 """Read sample bytes from a source, to identify the sensor that sent them.
 
-`read_samples` reads the beginning of a file, or listens to a live source for about a second. For
-sensors that send nothing until they are started, `probe` sends the start commands and reads the
-data that follows.
+`read_samples` reads the beginning of a file, or listens to a live source. `probe` also starts
+sensors that send nothing until they receive a command.
 """
 
 from __future__ import annotations
@@ -79,18 +78,14 @@ def read_samples(
 ) -> Iterator[SampleBytes]:
     """Yield the bytes of each sender of a source.
 
-    If the source is a serial port without a baud rate, each rate that installed sensors declare is
-    tried: first the most common, the lowest and the highest rate. If no bytes arrive at these three
-    rates, the sensor is silent, and the remaining rates are not tried.
+    For a serial port without a baud rate, tries the baud rates that installed sensors declare.
 
     Args:
-        source: the source.
         seconds: the time to listen to a live source, at each baud rate.
-        on_progress: a function that is called with a description of the source before each attempt.
+        on_progress: called with a description of the source before each attempt.
 
     Raises:
-        SourceError: if the source cannot be opened, or if it has no baud rate or port and no
-            installed sensor declares one.
+        SourceError: if the source cannot be opened, or if its baud rate or port is unknown.
     """
     text = str(source)
     address = live_address(source)
@@ -110,6 +105,7 @@ def read_samples(
         other_rates = [baud for baud in rates if baud not in first_rates]
         is_silent = True
         for baud in first_rates + other_rates:
+            # a sensor that sends would cause some bytes at one of the first rates
             if is_silent and baud in other_rates:
                 return
             on_progress(f"{text} at {baud} baud")
@@ -167,10 +163,7 @@ def _warn_of_other_senders(opened: LiveTransport) -> tuple[str, ...]:
 
 
 def _split_by_sender(sample: SampleBytes, chunks: Sequence[Chunk]) -> Iterator[SampleBytes]:
-    """Yield a copy of `sample` for each sender, with the chunks of this sender.
-
-    With only one sender, the attribute `sender` is "".
-    """
+    """Yield a copy of `sample` for each sender, with the chunks of the sender."""
     names = name_senders((chunk.sender, chunk.receiver) for chunk in chunks)
     by_sender: dict[str, list[Chunk]] = {name: [] for name in names.values()} or {"": []}
     for chunk in chunks:
@@ -185,7 +178,7 @@ def read_sensor_sample(source: str | Path, sensor: Sensor, seconds: float) -> li
     """Listen to a live source with the link settings of a sensor.
 
     Returns:
-        The bytes of each sender; an empty list if nothing arrives within `seconds`.
+        The bytes of each sender; an empty list if nothing arrives in time.
     """
     address = live_address(source)
     chunks = list[Chunk]()
@@ -226,10 +219,10 @@ def list_start_required() -> list[Sensor]:
 
 
 def probe(source: str | Path) -> Iterator[SampleBytes]:
-    """Start each sensor that needs a start command, and yield the received bytes.
+    """Start the sensors on a serial port, and yield the bytes that they send.
 
-    Each baud rate of a sensor is tried. The stop commands of the sensor are sent afterwards. Only
-    serial ports are probed; for any other source, nothing is yielded.
+    Sends the start commands of the installed sensors at each of their baud rates, and the stop
+    commands afterwards. For any other source, yields nothing.
 
     Raises:
         SourceError: if the port cannot be opened.

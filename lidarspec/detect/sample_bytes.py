@@ -1,7 +1,4 @@
-"""The bytes of one sender, from which its sensor is identified.
-
-The module also has functions that read the beginning of a file.
-"""
+"""Sample bytes of one sender, from which its sensor is identified."""
 
 from __future__ import annotations
 
@@ -26,15 +23,14 @@ class SampleBytes:
     """The bytes of one sender, and how they were received.
 
     Attributes:
-        source: the SOURCE, to open it again.
+        source: the SOURCE of the bytes.
         chunks: datagrams, or pieces of a stream.
         datagrams: whether `chunks` are datagrams.
-        baud: the baud rate at which a serial port was read; None for other sources, and for a port
-            without a baud rate.
-        sender: the address of the sender if the source has several senders; else "".
+        baud: the baud rate of a serial port; None if there is none.
+        sender: the address of the sender; "" if the source has only one sender.
         failure: the error if the source could not be opened; else None.
         warnings: warnings of the transport after reading.
-        ports: the UDP ports to which datagrams of a capture were sent.
+        ports: the destination ports of the datagrams in a capture.
     """
 
     source: str
@@ -58,7 +54,7 @@ class SampleBytes:
 
     @property
     def is_text(self) -> bool:
-        """Whether the first bytes are printable ASCII text. Some sensors send text."""
+        """Whether the first bytes are printable ASCII text."""
         head = self.data[:MAX_TEXT_BYTES]
         return (
             len(head) >= MIN_TEXT_BYTES
@@ -71,9 +67,7 @@ def read_beginning(opened: Transport, enough: int, *, max_chunks: int | None = N
     """Return the first chunks of a file.
 
     Args:
-        opened: the file.
-        enough: the number of bytes after which reading ends. A longer chunk is truncated to this
-            number.
+        enough: the number of bytes after which reading ends.
         max_chunks: maximum number of chunks; None for no limit.
     """
     return [

@@ -1,8 +1,7 @@
-"""Recognize bytes of sensors that are not installed, with the table of known sensors.
+"""Recognize bytes of known sensors that are not installed.
 
-Without the plugin, frames cannot be parsed. The sensor is recognized by the constant bytes at the
-start of a data frame, the frame size, and the UDP ports. These values may be the same for
-several sensors of a vendor, but the sensors of a vendor are in the same distribution.
+A sensor is recognized by the constant bytes at the start of its data frame, the frame size, and the
+UDP ports. Several sensors of a vendor may share these values.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ def _format_sync(constant: dict[int, int]) -> str:
     """Return the bytes at the start of a frame as text, such as "54 .. 2c".
 
     Args:
-        constant: offset -> value of each constant byte. Bytes that are not constant become "..".
+        constant: offset -> value. Other bytes become "..".
     """
     length = max(constant, default=-1) + 1
     return " ".join(
@@ -64,7 +63,7 @@ def _format_sync(constant: dict[int, int]) -> str:
 def recognize(sample: SampleBytes) -> list[KnownSensor]:
     """Return the known sensors without a plugin that may have sent the bytes.
 
-    If no frame matches, returns all sensors that use the destination port.
+    If no frame matches, returns the sensors with the same destination port.
     """
     installed = set(registry().names())
     missing = [row for row in known_sensors() if row.id not in installed]

@@ -15,11 +15,7 @@ MAX_PARSED_FRAMES = 4
 
 
 def find_unknown_codes(sensor: Sensor, frames: Sequence[Found]) -> list[str]:
-    """Return a message for each code in the frames that the spec does not name.
-
-    Fields in arrays are ignored, and so is the code 0, because sensors often leave unused fields at
-    0.
-    """
+    """Return a message for each code in the frames that the spec does not name."""
     texts: dict[str, str] = {}
     for name, frame in sensor.frames.items():
         paths = [
@@ -46,5 +42,6 @@ def _iter_unknown(
         value = parsed
         for step in path.split("."):
             value = value.get(step) if isinstance(value, dict) else None
+        # unused fields are often 0
         if isinstance(value, EnumValue) and value and not value.name:
             yield path, value
