@@ -1,7 +1,7 @@
 """Devices: sensors that were opened with `lidarspec.open`.
 
-A device reads a SOURCE. It returns packets and scans as they arrive, replies to commands, counters
-and warnings. Modules in reading order:
+A device reads a SOURCE. It returns packets, scans, replies to commands, counters and warnings.
+Modules in reading order:
 
 * `device`: `Device`, the public class.
 * `packet_reader`: makes packets of one frame type, and scans, from arriving frames.

@@ -1,8 +1,7 @@
 """A `Device` for asyncio.
 
 `AsyncDevice` calls the methods of a `Device` in its own threads, so that the event loop is never
-blocked. A thread stores each item in a `_ThreadedIterator`, from which an awaited call takes it. If
-the call is cancelled, the item is kept for the next call.
+blocked. An item that arrives during a cancelled call is kept for the next call.
 """
 
 from __future__ import annotations
@@ -90,7 +89,7 @@ class AsyncDevice:
             yield packets
 
     async def scans(self, *, select: Selection = EVERYTHING) -> AsyncIterator[Scan]:
-        """Yield scans; see `Device.scans`. The source is read from its start."""
+        """Yield scans from the start of the source; see `Device.scans`."""
         sieve = self.device.make_selector(select)
         async for scan in self._fetch(self._get_iterator("scans")):
             wanted = sieve.select(scan)
@@ -188,14 +187,13 @@ class AsyncDevice:
 
 
 class _ThreadedIterator(Generic[T]):
-    """The items of an iterator, which a thread reads for the event loop.
+    """An iterator that a thread reads for the event loop.
 
     Args:
-        source: the iterator. It yields None or an empty batch if nothing has arrived.
+        source: an iterator that yields None or an empty batch if nothing has arrived.
 
     Attributes:
         items: the items that the event loop has not taken yet.
-        ended: whether the iterator has ended.
     """
 
     def __init__(self, source: Iterator[Any]) -> None:
@@ -222,11 +220,7 @@ async def _run_in_thread(executor: ThreadPoolExecutor, function: Callable[[], T]
 
 
 async def _await_result(future: asyncio.Future[T]) -> T:
-    """Return the result of a future.
-
-    If the caller is cancelled, CancelledError is raised only after the future is done. Otherwise, a
-    device that is not completely opened or closed would keep its port.
-    """
+    """Return the result of a future; delay a cancellation until it is done."""
     try:
         return await asyncio.shield(future)
     except asyncio.CancelledError:
@@ -239,6 +233,6 @@ def open_async(
 ) -> AsyncDevice:
     """Open a sensor on any SOURCE, for ``async with``.
 
-    The arguments and errors are the same as those of `open`.
+    The arguments and errors are those of `open`.
     """
     return AsyncDevice(partial(open_device, source, sensor, **options))

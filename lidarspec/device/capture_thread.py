@@ -1,13 +1,11 @@
 """Read a live source in a thread, and queue the data for decoding.
 
-The thread only reads, records and queues, so that no byte is lost if the consumer is slow. The
-recording contains everything that arrives. The queue has a maximum size. If it is full, the policy
-"drop_oldest" drops the oldest chunks, and "block" makes the thread wait.
+The thread only reads, records and queues, so that a slow consumer causes no loss in the recording.
+If the queue is full, the policy "drop_oldest" drops the oldest chunks, and "block" makes the thread
+wait.
 
 If the device disappears, the thread reports this, and tries to open the device again with growing
-pauses between the attempts. It marks the first chunk after the gap. The duration of a silence is
-the sum of the durations of reads that returned nothing. Time during which the thread did not run is
-not included.
+pauses.
 """
 
 from __future__ import annotations
@@ -48,19 +46,15 @@ Event = tuple[str, Item]
 class BoundedQueue:
     """A queue of chunks and other events from the links of a device.
 
-    `len` returns the number of chunks in the queue.
-
     Args:
-        policy: what `put` does if the queue is full. "drop_oldest" drops the oldest chunks, and
-            "block" waits.
-        chunks: maximum number of chunks in the queue.
-        size: maximum total size of the chunks in the queue, in bytes.
+        policy: what a full queue does: "drop_oldest" or "block".
+        chunks: maximum number of chunks.
+        size: maximum total size of the chunks, in bytes.
 
     Attributes:
         produced: number of chunks that were put into the queue so far.
         consumed: number of chunks that were taken.
-        dropped: number of chunks that were dropped. ``produced == consumed + dropped + len(queue)``
-            always holds.
+        dropped: number of chunks that were dropped.
     """
 
     def __init__(
@@ -89,10 +83,7 @@ class BoundedQueue:
         return self._waiting
 
     def put(self, link: str, items: Iterable[Item]) -> None:
-        """Add events of a link in order.
-
-        If the queue is full, this drops the oldest chunks or waits, depending on the policy.
-        """
+        """Add events of a link in order; if the queue is full, apply the policy."""
         with self._changed:
             for item in items:
                 if isinstance(item, Chunk):
@@ -110,14 +101,12 @@ class BoundedQueue:
     def take(
         self, timeout: float, *, until: float = 0.0, chunks: int = MAX_QUEUED_CHUNKS
     ) -> list[Event]:
-        """Wait for events, remove them from the queue, and return them in order.
-
-        The list is empty if no event arrives in time, or if the queue is closed and empty.
+        """Remove events from the queue and return them; wait if it is empty.
 
         Args:
-            timeout: maximum time to wait, in seconds.
-            until: a time of `time.monotonic`. Events are collected until this time, but not longer
-                than `timeout`.
+            timeout: maximum time to wait, in seconds. If no event arrives in time, the result is
+                empty.
+            until: a time of `time.monotonic` until which events are collected.
             chunks: maximum number of events.
         """
         pause = min(until - time.monotonic(), timeout)
@@ -181,18 +170,16 @@ class CaptureThread:
     """The thread that reads a live transport.
 
     Args:
-        transport: the open transport; `close` closes it.
-        queue: receives the events.
+        transport: the open transport. `close` closes it.
         link: the name of the link.
         log: the recording; None to record nothing.
         clock: the host's clock, for recorded events.
 
     Attributes:
-        transport: the transport.
         connected: whether the device is connected.
         disconnects: number of times that the device has disappeared.
-        last_arrival: the time of `time.monotonic` when data last arrived; if none has arrived, the
-            time when the transport was opened.
+        last_arrival: the time of `time.monotonic` when data last arrived, or when the transport was
+            opened.
         warnings: warnings about the host's clock.
     """
 
@@ -229,8 +216,7 @@ class CaptureThread:
     def record(self, log: TrafficLog | None) -> None:
         """Start or replace the recording.
 
-        Events that wait in the queue are discarded. Therefore, all events that are taken from the
-        queue later are in the recording.
+        Events in the queue are discarded, so that all later events are in the recording.
 
         Args:
             log: the new recording; None to stop recording.
@@ -276,8 +262,8 @@ class CaptureThread:
         """Record and queue chunks.
 
         Args:
-            gap: whether data is missing before the first chunk. If so, the chunk is marked.
-            quiet: whether silence preceded the first chunk. If so, the chunk is marked.
+            gap: whether data is missing before the first chunk.
+            quiet: whether silence preceded the first chunk.
         """
         if gap or quiet:
             chunks[0] = replace(chunks[0], gap=gap, quiet=quiet)
@@ -289,10 +275,7 @@ class CaptureThread:
             self._queue.put(self._link, chunks)
 
     def _check_wall_clock(self, chunk: Chunk) -> None:
-        """Warn if the computer's wall clock was set, and record the change.
-
-        Arrival times continue without a step.
-        """
+        """Warn if the computer's wall clock was set, and record the change."""
         ahead = self._clock.find_step()
         if ahead is None:
             return
@@ -304,7 +287,7 @@ class CaptureThread:
             self._log.event("clock", chunk.at, ahead_ns=ahead)
 
     def _reconnect(self) -> bool:
-        """Report that the device has disappeared, and wait until it is back.
+        """Report that the device has disappeared, and wait for its return.
 
         Returns:
             True if the device is back, False if the capture was stopped first.

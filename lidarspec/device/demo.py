@@ -1,9 +1,8 @@
 """Demonstrate a complete session with a simulated sensor.
 
-A simulated serial sensor sends through a pseudo-terminal, or through a TCP port on systems without
-pseudo-terminals. Other simulated sensors send over UDP to this computer. Some of the sent data is
-damaged or dropped on purpose. The sensor is started, read and recorded. The recording is then
-decoded and has to give the same points.
+A simulated sensor sends over a pseudo-terminal, TCP or UDP. Some of its data is damaged or dropped
+on purpose. The demonstration starts the sensor, reads its scans and records them. Decoding the
+recording has to give the same points.
 """
 
 from __future__ import annotations
@@ -43,7 +42,6 @@ class Demonstration:
     """The results of the demonstration.
 
     Attributes:
-        sensor: the sensor.
         address: the SOURCE of the simulated sensor.
         error_share: the simulated share of lost datagrams, or of damaged bytes in a stream.
         replies: the replies to the commands that started the sensor.
@@ -76,13 +74,11 @@ def demonstrate(
 
     Args:
         scan_count: the number of complete scans.
-        errors: the share of lost datagrams, or of damaged bytes in a stream. In a stream, at most
-            one byte per frame is damaged on average.
+        errors: the share of lost datagrams, or of damaged bytes in a stream.
         seed: the seed of the errors and the scene.
 
     Raises:
-        SourceError: if the simulated sensor's port cannot be opened, or the scans do not arrive in
-            time.
+        SourceError: if the port cannot be opened, or the scans do not arrive in time.
         PluginError: if a function of the plugin raises.
     """
     if sensor.datagrams:

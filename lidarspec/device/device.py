@@ -1,7 +1,7 @@
 """A sensor on a source: it yields packets and scans, and takes commands.
 
-A `Device` gets frames from its input, which is a `FileInput` or a `LiveInput` with the same
-interface. A `PacketReader` makes packets and scans from the frames.
+A `Device` gets frames from a `FileInput` or a `LiveInput`. A `PacketReader` makes packets and scans
+from the frames.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ class Device(ClosingContext):
     """A sensor that was opened on a source; a context manager.
 
     Attributes:
-        source: the source that is read.
+        source: the SOURCE.
         sensor: the sensor, given or detected.
         mount: the pose of the sensor from `lidarspec.toml`; None if the file has none. With a
             mount, scans are in the axes of the carrier, and packets in the axes of the sensor.
         imu_samples: the IMU samples that arrived with the last batch of `packets`, in the axes of
-            the carrier if the sensor has a mount.
+            the carrier for a sensor with a mount.
     """
 
     def __init__(
@@ -125,9 +125,8 @@ class Device(ClosingContext):
     def warnings(self) -> list[str]:
         """The current warnings about the source and the sensor.
 
-        Examples are a truncated file, silence, a baud rate that is probably wrong, a small receive
-        buffer, frames of another sensor, unknown codes, scans without an end, times without a date,
-        lost returns, a nominal calibration, changes of the source of UTC, and errors of the plugin.
+        Examples are a truncated file, silence, a probably wrong baud rate, frames of another
+        sensor, a nominal calibration, and errors of the plugin.
         """
         stats = self.stats
         warnings = [*self._input.warnings, *self._check_first_frames()]
@@ -148,18 +147,14 @@ class Device(ClosingContext):
 
     @property
     def learned(self) -> Mapping[str, Any]:
-        """The options that the sensor reported when it was opened.
-
-        `sensor` is configured with them.
-        """
+        """The options that the sensor reported when it was opened."""
         return self._input.learned
 
     @property
     def info(self) -> dict[str, str]:
         """The facts that the sensor has reported about itself so far, by name.
 
-        Many sensors report "serial", "firmware", "model" or "temperature". Facts that no frame has
-        reported are missing.
+        Many sensors report "serial", "firmware", "model" or "temperature".
         """
         return read_info(self.sensor, self._input.info_frames.values())
 
@@ -193,8 +188,8 @@ class Device(ClosingContext):
     def packets(self, frame: str | None = None, *, wait: float | None = None) -> Iterator[Packets]:
         """Yield packets in batches, until the input ends or the device is closed.
 
-        A file is read only once: all iterators share one position in it. An iterator that is made
-        after a call of `latest` begins with the batch that completed the returned scan.
+        A file is read only once: all iterators share one position in it. After `latest`, a new
+        iterator begins with the batch that contains the end of the returned scan.
 
         Args:
             frame: the name of a frame type; by default the data frame.
@@ -235,7 +230,7 @@ class Device(ClosingContext):
             wait: if no packet arrives for this number of seconds, yield an empty dict.
 
         Yields:
-            Dicts of packets by frame type, with the types that have arrived.
+            Dicts: frame type -> packets. Types without new packets are omitted.
 
         Raises:
             UnknownFrame: for a frame type that the sensor does not have.
@@ -264,16 +259,15 @@ class Device(ClosingContext):
         """Yield scans, until the input ends or the device is closed.
 
         The first and the last scan, and the scans before and after an interruption, have
-        ``complete=False``. A scan whose end does not arrive is yielded after twice the duration of
-        the sensor's longest revolution, and `warnings` reports it.
+        ``complete=False``. A scan whose end is missing is yielded after twice the longest duration
+        of a revolution, with a warning.
 
-        A file is read only once: all iterators share one position in it. An iterator that is made
-        after a call of `latest` begins with the batch that completed the returned scan.
+        A file is read only once: all iterators share one position in it. After `latest`, a new
+        iterator begins with the batch that contains the end of the returned scan.
 
         Args:
             wait: if no scan arrives for this number of seconds, yield None.
-            select: which scans, and which parts of them, to yield. Reading stops after the last
-                selected scan. Long parts of a recording before the first selected scan are skipped.
+            select: which scans, and which parts of them, to yield.
 
         Raises:
             SourceError: if a file has already been read to its end.
@@ -288,9 +282,8 @@ class Device(ClosingContext):
     def imu(self, *, wait: float | None = None) -> Iterator[ImuSamples]:
         """Yield the samples of the sensor's IMU in batches, until the input ends.
 
-        The samples are in the axes of the carrier if the sensor has a mount. `Scan.imu` has the
-        samples that belong to a scan. A file is read only once: all iterators share one position in
-        it.
+        For a sensor with a mount, samples are in the axes of the carrier. A file is read only once:
+        all iterators share one position in it. `Scan.imu` has the samples of one scan.
 
         Args:
             wait: if no sample arrives for this number of seconds, yield an empty batch.
@@ -379,11 +372,9 @@ class Device(ClosingContext):
     ) -> ScanSelector:
         """Return a selector for the scans of this device.
 
-        The attribute `warnings` of the device includes the warnings of the selector.
-
         Args:
             select: the scans to select.
-            skip: a function that skips data that arrived before a time; see `ScanSelector`.
+            skip: skips data that arrived before a time; see `ScanSelector`.
         """
         self._selector = ScanSelector(select, self.source, skip)
         return self._selector
@@ -391,8 +382,7 @@ class Device(ClosingContext):
     def skip_until(self, time_ns: int) -> bool:
         """Skip input that arrived before a time, if the source can seek.
 
-        Frames that were already read are still returned. The stream then continues as after an
-        interruption.
+        Frames that were already read are still returned.
 
         Args:
             time_ns: ns since 1970.
@@ -403,7 +393,7 @@ class Device(ClosingContext):
         return self._input.skip_until(time_ns)
 
     def delay_decoding(self, until: float) -> None:
-        """Collect arriving data until a time, and decode it together.
+        """Delay decoding until a time, to decode more data together.
 
         This saves processor time. An iterator with `wait` still returns data after at most `wait`
         seconds. For a file, this method has no effect.
@@ -416,8 +406,8 @@ class Device(ClosingContext):
     def read_ahead(self, size: int) -> None:
         """Set how many bytes of a file are read and decoded at a time.
 
-        A viewer that shows a file at its recorded speed sets a small size, because counters and
-        observers include everything that was read. For a live source, this method has no effect.
+        A viewer that shows a file at its recorded speed sets a small size, because counters include
+        everything that was read. For a live source, this method has no effect.
 
         Args:
             size: the number of bytes; 0, the default, for the fastest size.
@@ -425,7 +415,7 @@ class Device(ClosingContext):
         self._input.read_ahead(size)
 
     def observe(self, observer: DecoderObserver) -> None:
-        """Pass all input that is decoded from now on, and its frames, to an observer.
+        """Pass all input that is decoded from now on to an observer.
 
         The observer is called in the thread that reads.
         """
@@ -434,7 +424,7 @@ class Device(ClosingContext):
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """Send a command and return the reply.
 
-        Returns at once with ``confirmed=False`` if the sensor documents no reply.
+        If the sensor documents no reply, returns at once with ``confirmed=False``.
 
         Args:
             name: the name of the command.
@@ -452,11 +442,10 @@ class Device(ClosingContext):
     def write(self, data: bytes, link: str = "data") -> None:
         """Send bytes as they are, without waiting for a reply.
 
-        A reply arrives among the other frames. The bytes are not interpreted. If they start the
-        sensor, `close` therefore does not stop it.
+        The bytes are not interpreted. A reply arrives among the other frames. `close` does not stop
+        a sensor that the bytes have started.
 
         Args:
-            data: the bytes.
             link: the name of one of the sensor's links.
 
         Raises:
@@ -470,10 +459,7 @@ class Device(ClosingContext):
         self._input.stays_on = True
 
     def close(self) -> None:
-        """Stop the sensor if it was started, and close the source.
-
-        A second call does nothing.
-        """
+        """Stop the sensor if it was started, and close the source."""
         self._finalizer()
 
     def __repr__(self) -> str:
@@ -559,10 +545,7 @@ class Device(ClosingContext):
             self._latest_stream = None
 
     def _take_batch_of_latest(self) -> FrameBatch | None:
-        """Return the batch that completed the last result of `latest`, for a new iterator.
-
-        Returns None for a live source, or if `latest` was not called. All unreturned scans of the
-        batch are removed from `_unseen_scans`, because the new iterator yields them.
+        """Return the batch with which an iterator begins after `latest`, or None.
 
         Raises:
             SourceError: if the file has been read to its end.
@@ -581,12 +564,7 @@ class Device(ClosingContext):
     def _iter_batches(
         self, wait: float | None, ahead: FrameBatch | None = None
     ) -> Iterator[FrameBatch | None]:
-        """Yield batches until the end of the input.
-
-        Args:
-            wait: if no batch arrives for this number of seconds, yield None; None for no limit.
-            ahead: a batch to yield first.
-        """
+        """Yield batches; yield None if no batch arrives for `wait` seconds."""
         if ahead is not None:
             yield ahead
         while not self._input.ended:
@@ -604,10 +582,7 @@ class Device(ClosingContext):
         return batch
 
     def _check_first_frames(self) -> list[str]:
-        """Return warnings if the first frames belong to another model, or have unknown codes.
-
-        The frames are checked once: when enough have arrived, or at the end of the input.
-        """
+        """Return warnings about frames of another model, or with unknown codes."""
         has_enough = len(self._first_frames) >= _MAX_CHECKED_FRAMES or self._input.ended
         if not self._is_checked and has_enough:
             self._is_checked = True
@@ -663,15 +638,15 @@ def open(
         backend: the backend that evaluates `points`: "auto", "numpy" or "jit".
         start: whether to send the commands that the sensor declares for opening and closing.
         record: where to record everything that arrives and is sent: a new file, a `Recorder`, or a
-            function that makes a recorder for the open transport.
+            function that returns a recorder for the open transport.
         overflow: what happens if the data of a live source is consumed too slowly: "drop_oldest" or
             "block". The default is "block" for a simulated sensor without a rate, else
             "drop_oldest".
-        period: seconds between two decodings of the data that has arrived.
+        period: seconds between two decodings of arrived data.
 
     Raises:
         SourceError: if the source cannot be opened.
-        UsageError, WireError: if no sensor is given and detection finds none, or several.
+        UsageError, WireError: if no sensor is given, and detection finds none or several.
         CommandError: if the device does not start.
     """
     settings = find_device(source)
@@ -690,10 +665,7 @@ def open(
 
 
 def _describe_nominal(sensor: Sensor) -> str:
-    """Return a warning that points use the model's nominal calibration.
-
-    The warning names the option that sets the calibration of the device.
-    """
+    """Return a warning that points use the model's nominal calibration."""
     text = f"{sensor.id}: points use the nominal calibration of the model, not that of the device"
     files = [name for name in sensor.configure.files if name not in sensor.options]
     if files:
@@ -713,10 +685,7 @@ def _make_recorder(
     own_recorders: list[TrafficLog],
     sensor: Sensor,
 ) -> TrafficLog | None:
-    """Return the requested recorder; None if nothing is recorded.
-
-    If the device has to close the recorder, it is added to `own_recorders`.
-    """
+    """Return the requested recorder; None if nothing is recorded."""
     if record is None:
         return None
     log, is_own = get_recorder(record, sensor, source, opened)

@@ -1,7 +1,7 @@
-"""The interface of a device's input (`DeviceInput`), and the input of a file (`FileInput`).
+"""The interface of a device's input, and the input of a file.
 
-An input returns frames in batches. `FileInput` reads a file or standard input, one batch each time
-the caller requests one. `live_input.LiveInput` reads a live source.
+`FileInput` reads a file or standard input. `live_input.LiveInput` reads a live source. Both return
+frames in batches.
 """
 
 from __future__ import annotations
@@ -40,10 +40,9 @@ class FrameBatch:
 
     Attributes:
         frames: the frames of all incoming types.
-        interrupted: whether input is missing after these frames. If so, no frame, packet or scan
-            continues in the next batch.
-        replaced: whether another sensor is read from now on. If so, all earlier frames have to be
-            discarded.
+        interrupted: whether input is missing after these frames, so that no frame or scan
+            continues.
+        replaced: whether another sensor is read from now on, so that earlier frames are discarded.
     """
 
     frames: list[Frames] = field(default_factory=list)
@@ -54,16 +53,14 @@ class FrameBatch:
 class DeviceInput(Protocol):
     """The source of a device's frames.
 
-    The implementations in this class are for files. `LiveInput` overrides the methods that differ
-    for a live source.
+    The methods of this class are for files. `LiveInput` overrides some of them.
 
     Attributes:
         is_live: whether data arrives from a live source, not from a file.
         decoder: finds the frames of the data link.
         stays_on: whether `close` leaves the sensor running.
         sensor: the sensor, configured with the `learned` options.
-        learned: the options that the sensor reported.
-        info_frames: name in `Sensor.info` -> the last frame that contains this information.
+        info_frames: name in `Sensor.info` -> the last frame with this information.
     """
 
     is_live: bool = False
@@ -74,10 +71,7 @@ class DeviceInput(Protocol):
     info_frames: Mapping[str, Found] = MappingProxyType({})
 
     def store_info_frames(self, batches: Sequence[Frames]) -> None:
-        """Store the last frame that contains the information of each name in `Sensor.info`.
-
-        A frame with optional parts is not stored if it lacks information that the stored frame has.
-        """
+        """Store the last frame with the information of each name in `Sensor.info`."""
         for frames in batches:
             for role, fact in self.sensor.reported.items():
                 for name in frames.names:
@@ -94,10 +88,7 @@ class DeviceInput(Protocol):
                 self.info_frames = {**self.info_frames, role: item}
 
     def _lacks_values(self, role: str, item: Found) -> bool:
-        """Return whether a frame lacks information that the stored frame has.
-
-        The result is False for a frame type without optional parts.
-        """
+        """Return whether a frame lacks information that the stored frame has."""
         earlier = self.info_frames.get(role)
         if earlier is None or not make_schema(self.sensor.frames[item.frame].tree).parts:
             return False
@@ -147,9 +138,7 @@ class DeviceInput(Protocol):
         """
 
     def delay_decoding(self, until: float) -> None:
-        """Collect arriving data until a time, and decode it together.
-
-        `next` delays data by at most `wait` seconds. For a file, this has no effect.
+        """Delay decoding of live data until a time, to decode more together.
 
         Args:
             until: a time of `time.monotonic`.
@@ -159,15 +148,12 @@ class DeviceInput(Protocol):
         """Send the commands that the sensor declares for opening.
 
         Raises:
-            CommandError: if an opening command fails. If the reply is missing, but the sensor sends
-                data or can be read without the reply, a warning is added instead.
+            CommandError: if an opening command fails, unless the sensor can be read without a
+            reply.
         """
 
     def next(self, wait: float) -> FrameBatch | None:
-        """Return the next batch of frames.
-
-        Args:
-            wait: seconds to wait.
+        """Return the next batch of frames; wait at most `wait` seconds.
 
         Returns:
             The batch, or None if no frame arrives in time, or at the end.
@@ -186,7 +172,7 @@ class DeviceInput(Protocol):
         return True
 
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
-        """Send a command and return the reply; may be called in several threads.
+        """Send a command from any thread, and return the reply.
 
         Raises:
             UnknownCommand, UnknownField, MissingField, OutOfRange: for an invalid command; nothing
@@ -196,7 +182,7 @@ class DeviceInput(Protocol):
         """
 
     def write(self, data: bytes, link: str = "data") -> None:
-        """Send bytes without interpreting them; a reply is read like all other data.
+        """Send bytes without interpreting them or waiting for a reply.
 
         Raises:
             UsageError: if `data` is a str, or if the sensor does not have the link.
@@ -208,16 +194,13 @@ class DeviceInput(Protocol):
         return FirstFrames()
 
     def close(self) -> None:
-        """Stop the sensor if it was started, and release all resources.
-
-        A second call does nothing.
-        """
+        """Stop the sensor if it was started, and release all resources."""
 
 
 def decode_chunks(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
     """Return the frames that consecutive chunks complete.
 
-    Each frame has the arrival time of the chunk that contains its last byte.
+    The arrival time of a frame is that of its last byte.
     """
     if not decoder.stream:
         return [decoder.datagrams([chunk.data for chunk in chunks], [chunk.at for chunk in chunks])]
@@ -239,7 +222,7 @@ def _decode_stream(
 ) -> Iterator[list[Frames]]:
     """Yield the frames in captured datagrams that carry a byte stream.
 
-    Each frame has the arrival time of the datagram that contains its last byte.
+    The arrival time of a frame is that of its last byte.
 
     Args:
         size: number of bytes that are decoded together.
@@ -254,10 +237,9 @@ def _decode_stream(
 def _set_arrival(
     batches: Iterable[Frames], ends: NDArray[np.int64], times: NDArray[np.int64]
 ) -> list[Frames]:
-    """Return frames with the arrival time of the datagram that contains their last byte.
+    """Return frames with the arrival times of their last bytes.
 
     Args:
-        batches: the frames.
         ends: the end of each datagram, (n,) bytes from the start of the input.
         times: the arrival time of each datagram, (n,) ns since 1970; -1 if unknown.
     """
@@ -284,11 +266,11 @@ BATCH_CHUNKS = 1024
 class FileInput(DeviceInput):
     """Input from a file or standard input.
 
-    Data is read only when it is requested, so nothing is ever dropped.
+    Data is read only when it is requested.
 
     Attributes:
         state: "streaming", "ended" or "closed".
-        senders: checks that one sensor sends all frames.
+        senders: checks that all frames are from one sensor.
     """
 
     state = "streaming"
@@ -370,8 +352,8 @@ class FileInput(DeviceInput):
     def first_frames(self) -> FirstFrames:
         """Return the frames to use before the first packet of the file.
 
-        To find these frames, the file is opened and read a second time. The result is empty if the
-        sensor needs no such frames, or if the source cannot be read twice, such as standard input.
+        The file is opened and read a second time. The result is empty if the sensor needs no such
+        frames, or if the source can be read only once.
         """
         path = Path(str(self._source).partition("?")[0])
         if not needs_first_frames(self.sensor) or not (
@@ -422,10 +404,7 @@ class FileInput(DeviceInput):
         yield FrameBatch(self.decoder.take_pending())
 
     def _iter_chunk_batches(self) -> Iterator[list[Chunk]]:
-        """Yield the chunks in batches to decode together.
-
-        A batch ends before a gap or a silence, because no frame continues after it.
-        """
+        """Yield the chunks in batches to decode together."""
         batch: list[Chunk] = []
         size = 0
         for chunk in self._iter_portions():

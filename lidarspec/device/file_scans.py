@@ -1,14 +1,12 @@
-"""Read the scans of a file, from its start or from a bookmark, also in another process.
+"""Read the scans of a file, from its start or from a bookmark.
 
-Decoding from the middle of a file needs state from the bytes before that position, for example an
-incomplete frame, the number of clock wraps and the direction of rotation. A bookmark is this state,
-pickled. The scans that are read from a bookmark on are identical to the scans of an uninterrupted
-reading. The functions and structs of a sensor cannot be pickled, but they do not depend on the
-input. A bookmark therefore refers to them by name. When reading is resumed, they are taken from the
-sensor that the caller passes.
+A bookmark is the pickled state of the decoding at a position in a file, for example an incomplete
+frame and the number of clock wraps. Reading from a bookmark returns the same scans as an
+uninterrupted reading. The functions and structs of a sensor cannot be pickled, so a bookmark refers
+to them by name.
 
-Bookmarks divide a file into pieces. A scan belongs to the piece in which it begins. Therefore, the
-last scan of a piece is read to its end beyond the bookmark, and the next piece omits this scan.
+Bookmarks divide a file into pieces. A scan belongs to the piece in which it begins, even if it ends
+in the next piece.
 """
 
 from __future__ import annotations
@@ -46,13 +44,9 @@ _PLAIN_TYPES = (bool, int, float, str, bytes, type(None), type)
 class FileScans(ClosingContext):
     """The scans of a file, as an iterable.
 
-    `survey` counts scans without computing points, and returns a bookmark from which to continue.
-
     Args:
-        source: the file.
-        sensor: the sensor that sent the data.
-        bookmark: the start, as returned by `survey` for the same file and sensor; None for the
-            start of the file.
+        bookmark: the start, from `survey` for the same file and sensor; None for the start of the
+            file.
 
     Raises:
         UsageError: for a source that is not a file, or a sensor without points.
@@ -101,15 +95,14 @@ class FileScans(ClosingContext):
         yield from self._stream.finish()
 
     def survey(self, size: int) -> tuple[int, bytes | None]:
-        """Read the next piece of the file and count its scans.
+        """Count the scans of the next piece of the file, without computing points.
 
         Args:
-            size: minimum size of the piece, in bytes. If a bookmark cannot be made at this size,
-                the piece is longer.
+            size: minimum size of the piece, in bytes.
 
         Returns:
-            The number of scans that begin in the piece, and the bookmark of the next piece. At the
-            end of the file, the bookmark is None.
+            The number of scans that begin in the piece, and the bookmark of the next piece; None at
+            the end of the file.
         """
         scan_count = 0
         end = self._offset + size
@@ -150,11 +143,7 @@ class FileScans(ClosingContext):
         return reader.offset
 
     def _make_bookmark(self) -> bytes | None:
-        """Return the pickled state.
-
-        Returns None if the state cannot be pickled, or if the file cannot be read from this
-        position.
-        """
+        """Return the pickled state; None if reading cannot be resumed from here."""
         opened = self._transport
         if not isinstance(opened, FileTransport) or not opened.can_resume:
             return None
@@ -184,10 +173,7 @@ class FileScans(ClosingContext):
 
 
 def _find_constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
-    """Return the objects to which a bookmark refers by name: name -> object.
-
-    They are the sensor, its parts, and objects that are made from the sensor alone.
-    """
+    """Return the objects to which a bookmark refers by name: name -> object."""
     constants = dict[tuple[Any, ...], Any]()
     _name_parts(sensor, (), constants, set())
     codecs = {("codec", name): get_codec(frame) for name, frame in sensor.frames.items()}
@@ -197,12 +183,11 @@ def _find_constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], A
 def _name_parts(
     value: Any, name: tuple[Any, ...], names: dict[tuple[Any, ...], Any], seen: set[int]
 ) -> None:
-    """Store a value and all its parts in `names`.
+    """Store a value and its parts in `names`.
 
     Args:
-        value: the value.
         name: the attributes and keys that lead from the sensor to the value.
-        names: name -> object. The results are added.
+        names: name -> object; modified.
         seen: the ids of all objects in `names`.
     """
     if isinstance(value, _PLAIN_TYPES) or id(value) in seen:
@@ -232,22 +217,14 @@ class _StatePickler(pickle.Pickler):
         self._frames = {id(get_codec(frame).schema): name for name, frame in sensor.frames.items()}
 
     def persistent_id(self, obj: Any) -> Any:
-        """Return the name of a constant; None for an object that has to be pickled.
-
-        If the object is a copy of the sensor with another clock, the result contains the name of
-        the clock.
-        """
+        """Return the name of a constant; None for an object to pickle."""
         name = self._names.get(id(obj))
         if name is None and isinstance(obj, Sensor):
             return ("clock", self._names[id(obj.clock)])
         return name
 
     def reducer_override(self, obj: Any) -> Any:
-        """Return the function and the arguments that restore a table or packets.
-
-        A table is pickled as the bytes of its frames. Packets are pickled with the frames in
-        `state` that they refer to. A `struct.Struct` is pickled as its format.
-        """
+        """Return the function and the arguments that restore a table or packets."""
         if isinstance(obj, CompiledTable | ParsedTable):
             if id(obj.schema) not in self._frames:
                 raise pickle.PicklingError(
@@ -288,14 +265,14 @@ def _make_table(sensor: Sensor, frame: str, frames: list[bytes]) -> Table:
 
 
 def _take_states(table: Table | None, which: Any) -> StateOf:
-    """Remove the frames that no packet uses from a table.
+    """Return a table without unused frames.
 
     Args:
         table: frames that packets refer to.
         which: for each packet, the row of its frame in `table`; -1 for a packet without a frame.
 
     Returns:
-        The table with the remaining frames, and `which` for this table.
+        The table with the remaining frames, and `which` for the new table.
     """
     rows = np.unique(which[which >= 0])
     if table is None or not len(rows):

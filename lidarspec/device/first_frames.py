@@ -1,8 +1,7 @@
 """Search a file for frames that are needed to decode its first packets.
 
-Some packets can be decoded only with a frame of another type, such as a calibration
-(`Sensor.state`) or a frame with the date. In a file, this frame may come after the first packets.
-The first such frame is therefore used as if it were at the start of the file.
+Some packets can be decoded only with a frame of another type, such as a calibration or a date. If
+this frame comes after the first packets of a file, it is used from the start of the file.
 """
 
 from __future__ import annotations
@@ -45,8 +44,7 @@ def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstF
     """Return the frames to use before the first packet of a file.
 
     Args:
-        sensor: the sensor that sent the frames.
-        batches: the frames of the file. The iteration ends when all needed frames are found.
+        batches: the frames of the file, which are read until all needed frames are found.
     """
     first = FirstFrames()
     missing = set(sensor.state)

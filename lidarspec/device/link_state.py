@@ -1,7 +1,4 @@
-"""Watch the data link of a live sensor.
-
-`LinkState` warns of silence, bytes without frames and a lost device, and suggests a command to run.
-"""
+"""Watch the data link of a live sensor, and warn if no valid data arrives."""
 
 from __future__ import annotations
 
@@ -87,10 +84,7 @@ class LinkState:
 
     @property
     def name(self) -> str:
-        """The state in one or two words.
-
-        It is "disconnected", "silent", "no frames", "waiting" (for the first frame) or "streaming".
-        """
+        """The state: "disconnected", "silent", "no frames", "waiting" or "streaming"."""
         if not self._capture.connected:
             return "disconnected"
         if self.silent_for > SILENT_AFTER_S:
@@ -148,10 +142,7 @@ class LinkState:
         return self._decoder.stats.bytes_in - self._framed_bytes
 
     def _is_frameless(self) -> bool:
-        """Return whether no frame was found for a long time although bytes have arrived.
-
-        The number of bytes must be larger than the longest frame.
-        """
+        """Return whether many bytes, but no frame, have arrived for a long time."""
         if self._frameless_since is None:
             return False
         seconds = time.monotonic() - self._frameless_since

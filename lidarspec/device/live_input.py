@@ -1,11 +1,10 @@
 """The input of a live source: decode queued chunks in the thread of the consumer.
 
-The capture threads queue chunks, which are decoded together every few milliseconds.
+The capture threads queue chunks. `LiveInput.next` decodes queued chunks every few milliseconds and
+returns the frames. It also sends the requests of the `Session`, and passes replies to the session.
 
-`next` decodes the chunks that have arrived and returns the frames. While it waits, it also runs the
-`Session`: it sends requests, and passes frames that may be replies to the session. Only one thread
-may run the decoders at a time. If another thread calls `send` meanwhile, the thread that runs the
-decoders finds the reply for it. `LinkState` watches the data link.
+Only one thread may run the decoders at a time. If another thread calls `send` meanwhile, the
+decoding thread also receives the reply to this command.
 """
 
 from __future__ import annotations
@@ -63,15 +62,12 @@ class LiveInput(DeviceInput):
     """The input of a sensor on a live transport.
 
     Args:
-        source: the source.
-        sensor: the sensor on the source.
         opened: the open transport of the data link.
         backend: the backend that evaluates `points`: "auto", "numpy" or "jit".
         policy: what happens if the queue is full, "drop_oldest" or "block"; see `BoundedQueue`.
-        record: a function that makes the recorder for the configured sensor, or returns None. The
-            recorder gets all data that is sent or arrives.
-        will_begin: whether `begin` will be called. If the sensor reports options during `begin`,
-            all earlier data is discarded.
+        record: returns the recorder for the configured sensor, or None. The recorder gets all data
+            that is sent or arrives.
+        will_begin: whether `begin` will be called.
         period: seconds between two decodings.
     """
 
@@ -294,11 +290,7 @@ class LiveInput(DeviceInput):
             raise type(error)("; ".join([str(error), *remarks])) from None
 
     def _set_own_endpoint(self, name: str) -> None:
-        """Pass this computer's address and port to the session, if a command needs them.
-
-        Args:
-            name: the name of the command.
-        """
+        """Pass this computer's address and port to the session, if a command needs them."""
         command = self.sensor.commands.get(name)
         if command is not None and command.has_own_port:
             self._session.port = self._captures["data"].transport.own_port
@@ -378,7 +370,7 @@ class LiveInput(DeviceInput):
         """Run the decoders once, unless another thread runs them.
 
         Args:
-            pending: a command that the caller waits for; if it is done, the decoders do not run.
+            pending: a command that the caller waits for. If it is done, the decoders do not run.
         """
         if not self._decoder_lock.acquire(timeout=MAX_PUMP_S / 5):
             return
@@ -391,10 +383,7 @@ class LiveInput(DeviceInput):
             self._ready.popleft()
 
     def _pump(self, wait: float) -> None:
-        """Decode data that arrives within `wait` seconds, and run the session.
-
-        The wait ends at the deadline of the session, if the deadline is earlier.
-        """
+        """Decode data that arrives within `wait` seconds, and run the session."""
         # If the deadline passed more than `MAX_PUMP_S` ago, this computer is overloaded, and the
         # reply may be in data that was not read yet. Wait for the full time before the request
         # times out.
@@ -477,11 +466,7 @@ class LiveInput(DeviceInput):
         self._deliver("data", batches)
 
     def _select_sensor_chunks(self, chunks: list[Chunk]) -> list[Chunk]:
-        """Return the chunks that the sensor sent.
-
-        If another sender is selected as the sensor, incomplete frames of the previous sender are
-        discarded.
-        """
+        """Return the chunks that the sensor sent."""
         mine = self._senders.select(chunks)
         self._link_state.record_senders(is_sensor=bool(mine))
         if self._senders.has_changed:
@@ -490,10 +475,7 @@ class LiveInput(DeviceInput):
         return mine
 
     def _select_first_sender(self, link: str, chunks: list[Chunk]) -> list[Chunk]:
-        """Return the chunks of the first sender that replied to a broadcast.
-
-        When this sender is found, it is selected as the sensor on every link.
-        """
+        """Return the chunks of the first sender that replied to a broadcast."""
         mine = self._broadcast_senders[link].select(chunks)
         if (address := self._broadcast_senders[link].address) is not None:
             self._captures[link].transport.accept(address)
@@ -532,11 +514,8 @@ class LiveInput(DeviceInput):
         return link.reported if isinstance(link, Tcp) else ""
 
     def _connect_to_reported_port(self) -> None:
-        """Connect to the port of the data, if a reply has just reported it.
-
-        The connection has to be made before the next command is sent, because this command may
-        start the data.
-        """
+        """Connect to the port of the data if a reply has reported the port."""
+        # connect before the next command, which may start the data
         transport = self._captures["data"].transport
         port = self._session.provided.get(self._reported_port_name)
         if not transport.awaits_port or port is None:
@@ -550,10 +529,7 @@ class LiveInput(DeviceInput):
                 self._failure = error
 
     def _request_port_again(self) -> None:
-        """Send the opening commands again, because a reply contains the port of the data.
-
-        Does nothing if the commands were repeated less than `REPEAT_PAUSE_S` ago.
-        """
+        """Repeat the opening commands, because a reply contains the port of the data."""
         if time.monotonic() >= self._repeat_due_s:
             self._repeat_due_s = time.monotonic() + REPEAT_PAUSE_S
             self._restart_sensor()
@@ -570,10 +546,7 @@ class LiveInput(DeviceInput):
             self._send_outgoing()
 
     def _warn_if_changed(self) -> None:
-        """Warn if a reconnected sensor reports other options than before the disconnection.
-
-        It may be another device of the same model.
-        """
+        """Warn if a reconnected sensor reports other options than before."""
         done = [pending for pending in self._restart_replies if pending.done]
         self._restart_replies = [pending for pending in self._restart_replies if not pending.done]
         for pending in done:
@@ -591,10 +564,10 @@ class LiveInput(DeviceInput):
                 ]
 
     def _send_outgoing(self) -> LidarSpecError | None:
-        """Send the session's outgoing data; if this fails, fail the session's requests.
+        """Send the session's data; if this fails, fail the session's requests.
 
         Returns:
-            The error; None if everything was sent.
+            The error; None if the data was sent.
         """
         failure: LidarSpecError | None = None
         for outgoing in self._session.take_outgoing():
@@ -642,10 +615,7 @@ def _is_broadcast(link: Link | None) -> bool:
 
 
 def _join_chunks(events: list[Event]) -> list[tuple[str, list[Chunk] | LinkEvent | BaseException]]:
-    """Return the events, but with consecutive chunks of the same link joined in one list.
-
-    A chunk after a gap begins a new list.
-    """
+    """Return the events, with consecutive chunks of a link joined in one list."""
     joined: list[tuple[str, list[Chunk] | LinkEvent | BaseException]] = []
     run: list[Chunk] = []  # the last list of chunks; empty after another event
     for link, item in events:

@@ -6,13 +6,13 @@
     mount = {x = 0.2, yaw_deg = 90, inverted = true}
     options = {calibration = "./angles.csv"}
 
-A name can be used wherever a SOURCE is expected. A file called front is written as ``./front``. Two
-files are read: the file in the user's configuration directory, and the project's file. The
-project's file is the nearest file that the user owns, in the working directory or above it. It
-cannot override names of the user's file. A project may be untrusted. Unless the user has allowed
-its folder, the project's file cannot run Python or refer to paths outside the folder. A mistake in
-a file disables only the devices of that file. The table [owners] in the user's own file decides
-which plugin provides a sensor; `plugins` reads it.
+A name can be used instead of a SOURCE; a file called front is written as ``./front``. Two files are
+read: the file in the user's configuration directory, and the nearest file that the user owns in the
+working directory or above it (the project's file).
+
+A project may be untrusted. Its file cannot replace devices of the user's file. Unless the user has
+allowed its folder, it cannot run Python or refer to paths outside the folder. A mistake in a file
+disables only the devices of that file.
 """
 
 from __future__ import annotations
@@ -52,15 +52,11 @@ class NamedDevice:
 
     Attributes:
         name: the name of the device.
-        source: the SOURCE that is opened.
         sensor: id, alias or path of a module; None to detect the sensor.
         mount: the pose of the sensor; None if not given.
-        options: options of the sensor.
-        file: the settings file.
-        shadowed_file: another settings file, whose device of the same name is ignored; "" if there
-            is none.
-        is_trusted: whether the settings file is the user's own, or in a folder that the user has
-            allowed.
+        shadowed_file: another settings file with a device of the same name, which is ignored; "" if
+            there is none.
+        is_trusted: whether the settings file is the user's own, or in an allowed folder.
     """
 
     name: str
@@ -98,10 +94,7 @@ class NamedDevice:
         return configured
 
     def find_refusal(self) -> UsageError | None:
-        """Return the error for a device that only a trusted file may declare.
-
-        Returns None if the device is allowed.
-        """
+        """Return an error if only a trusted file may declare the device, else None."""
         if self.is_trusted:
             return None
         folder = Path(self.file).parent
@@ -137,9 +130,8 @@ def find_device(source: str | Path) -> NamedDevice | None:
     """Return the device with this name; None for every other SOURCE.
 
     Raises:
-        UsageError: for a mistake in the settings file (the message names table and key), for a
-            device that is allowed only in a trusted folder, or for a word that is neither a name
-            nor a file.
+        UsageError: for a mistake in the settings file, a device that is not allowed, or a word that
+            is neither a name nor a file.
         SourceError: if the settings file cannot be read.
     """
     word = str(source)
@@ -197,8 +189,7 @@ def _read_all() -> tuple[dict[str, NamedDevice], list[LidarSpecError]]:
 def find_settings_files() -> list[Path]:
     """Return the settings files that apply in the working directory.
 
-    They are the user's own file and the nearest file of a project, if they exist. Files of other
-    users are skipped with a warning.
+    Files of other users are skipped with a warning.
     """
     own = own_settings()
     here = Path.cwd()
@@ -216,7 +207,7 @@ def read_settings_file(path: Path) -> dict[str, NamedDevice]:
     """Return the devices of one settings file by name.
 
     Raises:
-        UsageError: for a mistake in the file; the message names table and key.
+        UsageError: for a mistake in the file.
         SourceError: if the file cannot be read.
     """
     content = read_document(path)
@@ -312,10 +303,7 @@ def _make_suggestion(word: str, words: Iterable[str]) -> str:
 
 
 def _resolve_path(path: Path, value: Any) -> Any:
-    """Resolve a path starting with ./ or ../ against the folder of the settings file.
-
-    Other values are returned unchanged.
-    """
+    """Resolve a path starting with ./ or ../ against the folder of the settings file."""
     if isinstance(value, str) and value.startswith(("./", "../")):
         return str(path.parent / value)
     return value

@@ -1,7 +1,7 @@
 """Make packets of one type, and scans, from batches of frames.
 
-The batches of a source are passed to one `PacketReader` in order. Decoding a packet may require
-state from earlier packets, which the reader stores.
+One `PacketReader` receives all batches of a source in order, because decoding a packet may require
+state from earlier packets.
 """
 
 from __future__ import annotations
@@ -32,14 +32,11 @@ class PacketReader:
     """Makes packets of one frame type, and IMU samples, from batches of frames.
 
     Args:
-        sensor: the sensor that sends the frames.
-        frame: the frame type; None for the data frame. If the sensor has several data frame types,
-            None selects the type that arrives first.
-        decoder: the decoder that finds the frames.
+        frame: the frame type; None for the data frame type that arrives first.
         first: frames to use before the first packet.
 
     Attributes:
-        last: the packets of the last batch whose frame type was known; None if there was none.
+        last: the packets of the last batch with a known frame type; None if there was none.
         imu_samples: the IMU samples of the last batch.
     """
 
@@ -64,10 +61,7 @@ class PacketReader:
         return None
 
     def add(self, batch: FrameBatch) -> Packets | None:
-        """Return the packets in a batch of frames; None if their type is not known yet.
-
-        Frames that arrive before their type is known are stored for a later call.
-        """
+        """Return the packets in a batch of frames; None if their type is not known yet."""
         if batch.replaced:  # another sensor is read from now on
             self._undecided.clear()
             self._stream = self._make_first_stream()
@@ -91,7 +85,7 @@ class PacketReader:
         """Read the IMU samples of a batch, and store them in `imu_samples`.
 
         Args:
-            packets: the packets of the batch; some sensors have IMU samples in their data frames.
+            packets: the packets of the batch, which may contain IMU samples.
         """
         if self._imu is None:
             return
@@ -114,9 +108,8 @@ class PacketReader:
         """Yield the scans that a batch completes; an interruption ends the last scan.
 
         Args:
-            stream: the stream that divides packets into scans.
-            batch: the next frames.
-            is_added: whether `add` was already called with `batch`, so that `last` has its packets.
+            stream: divides packets into scans.
+            is_added: whether `add` was already called with `batch`.
         """
         packets = self.last
         if not is_added:
@@ -133,10 +126,7 @@ class PacketReader:
         return stream.add([])
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a bookmark (see `FileScans`), which is pickled.
-
-        Packets and samples that were already returned are left out.
-        """
+        """Return the state for a bookmark (see `FileScans`), which is pickled."""
         return {**vars(self), "last": None, "imu_samples": join_samples([])}
 
     def _make_first_stream(self) -> PacketStream | None:

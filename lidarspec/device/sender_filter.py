@@ -1,10 +1,10 @@
-"""Select the datagrams of one sensor, so that frames of two sensors are never mixed.
+"""Select the datagrams of one sensor.
 
-All data of a sensor comes from one IP address. The frames of one type come from one port, which can
-change after a restart. If two ports alternate, they belong to two sensors. In a file, frames of two
-sensors are an error (`SenderCheck`), and the user has to select one. For a live source, the first
-sender of data frames is selected (`SenderFilter`), and datagrams of other senders are dropped
-before they are decoded.
+All data of a sensor comes from one IP address. The frames of one type come from one port, which may
+change after a restart. Two alternating ports belong to two sensors.
+
+For a file, `SenderCheck` raises an error if two sensors send frames. For a live source,
+`SenderFilter` selects the first sender of data frames, and drops the datagrams of other senders.
 """
 
 from __future__ import annotations
@@ -28,12 +28,7 @@ MAX_SENDERS = 16
 
 
 class SenderCheck:
-    """Checks that all frames of a file are from one sensor.
-
-    Args:
-        source: the file, for messages.
-        sensor: the sensor.
-    """
+    """Checks that all frames of a file are from one sensor."""
 
     def __init__(self, source: str | Path, sensor: Sensor) -> None:
         self._source = source
@@ -46,7 +41,7 @@ class SenderCheck:
         """Check the senders of the next frames.
 
         Args:
-            sent: the type and the sender of each frame.
+            sent: (frame type, sender) of each frame.
 
         Raises:
             UsageError: if two sensors have sent frames.
@@ -62,10 +57,7 @@ class SenderCheck:
                 raise self._make_error(other, sender)
 
     def _find_concurrent_port(self, name: str, sender: Sender) -> Sender | None:
-        """Return another port that sends the same frame type at the same time as `sender`.
-
-        If there is no such port, returns None and stores `sender` as the current port.
-        """
+        """Return another port that sends the same frame type at the same time as `sender`."""
         port = self._current.setdefault(name, sender)
         previous = self._previous.setdefault(name, {})
         if sender == port:
@@ -93,16 +85,14 @@ class SenderCheck:
 class SenderFilter(SenderCheck):
     """Selects the datagrams of one sensor from a live source.
 
-    The sensor is the first sender of data frames. Until a data frame arrives, it is the first
-    sender of any frame.
+    The sensor is the first sender of data frames, or of other frames if no data frame has arrived.
 
     Args:
         datagrams: whether each datagram is a whole frame, not a part of a byte stream.
 
     Attributes:
         foreign: number of datagrams of other senders so far.
-        other_sender: the first other sender; None if there is none.
-        has_changed: whether the last call of `select` has changed the selected sender.
+        has_changed: whether the last call of `select` has selected another sensor.
     """
 
     def __init__(self, source: str | Path, sensor: Sensor, *, datagrams: bool) -> None:
@@ -145,11 +135,7 @@ class SenderFilter(SenderCheck):
         return [f"{text}; next: repeat with {other} to read the other sender"]
 
     def select(self, chunks: Sequence[Chunk]) -> list[Chunk]:
-        """Return the datagrams that the sensor sent, and count the others.
-
-        Until a frame has arrived, all datagrams are returned. If the datagrams are pieces of a
-        stream, only the datagrams of the first sender are returned.
-        """
+        """Return the datagrams of the sensor, and count all other datagrams."""
         mine: list[Chunk] = []
         self.has_changed = False
         for chunk in chunks:
@@ -165,14 +151,7 @@ class SenderFilter(SenderCheck):
         return mine
 
     def select_ports(self, sent: Sequence[tuple[str, Sender]], frames: Frames) -> Frames:
-        """Return the frames from the ports of the sensor, and count the other frames.
-
-        Another port at the same address may belong to another sensor.
-
-        Args:
-            sent: the result of `frame_senders` for the frames.
-            frames: frames from the address of the sensor.
-        """
+        """Return the frames from the ports of the sensor, and count the other frames."""
         count_before = len(self._other_senders)
         for name, sender in sent:
             if sender not in self._other_senders:
@@ -188,7 +167,7 @@ class SenderFilter(SenderCheck):
         return frames.select(np.array(mine, np.bool_))
 
     def _update_owner(self, sender: Sender, chunk: Chunk) -> bool:
-        """Store the sender of a chunk as the sensor if the frames in the chunk prove it.
+        """Select the sender of a chunk as the sensor if the chunk has suitable frames.
 
         Returns:
             Whether the sender replaces another sender.
@@ -225,20 +204,14 @@ class SenderFilter(SenderCheck):
         return sender[0] == owner[0] and sender not in self._other_senders
 
     def _find_frame_types(self, sender: Sender, chunk: Chunk) -> set[str]:
-        """Return the types of the frames that a datagram completes.
-
-        Only `MAX_SENDERS` senders are examined; for further senders, the result is empty.
-        """
+        """Return the types of the frames that a datagram completes."""
         if sender not in self._probes and len(self._probes) >= MAX_SENDERS:
             return set()
         decoder = self._probes.setdefault(sender, self._sensor.decoder(stream=not self._datagrams))
         return {item.frame for item in decoder.feed(chunk.data)}
 
     def _update_port(self, name: str, sender: Sender) -> None:
-        """Store the port from which the sensor currently sends a frame type.
-
-        Ports that send the same type at the same time are added to `_other_senders`.
-        """
+        """Store the port from which the sensor currently sends a frame type."""
         concurrent_port = self._find_concurrent_port(name, sender)
         if concurrent_port is not None:
             self._other_senders |= dict.fromkeys([*self._previous[name], concurrent_port])
@@ -256,12 +229,10 @@ class SenderFilter(SenderCheck):
 def frame_senders(chunks: Sequence[Chunk], frames: Frames, end: int) -> list[tuple[str, Sender]]:
     """Return (frame type, sender) of each frame in some datagrams.
 
-    If all datagrams have one sender, the result has one item for each frame type instead of each
-    frame. If the sender of a datagram is unknown, the result is empty.
+    If all datagrams have one sender, each frame type is returned only once. If a sender is unknown,
+    the result is empty.
 
     Args:
-        chunks: the datagrams.
-        frames: the frames in the datagrams.
         end: the end of the last datagram, in bytes since the start of the input.
     """
     senders = {chunk.sender for chunk in chunks}

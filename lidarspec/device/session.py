@@ -1,23 +1,16 @@
 """Commands and their replies, without I/O.
 
-The session takes requests and returns bytes to send. It takes received frames and returns replies.
-The caller passes all times, in ns of one monotonic clock. Each link has at most one current
-request. Further requests wait in a queue until the current request is done and the device has
-settled. All frames that arrive on the link, including data frames, are compared with the expected
-reply.
+The session takes requests and received frames, and returns bytes to send and replies. The caller
+passes all times, in ns of one monotonic clock. Each link has at most one current request, and a
+queue of further requests. Every frame that arrives on the link is compared with the expected reply.
 
-A late reply must not be taken for the reply to the next request. If no reply to a command arrives
-in time, the session therefore expects it until twice the timeout has passed. During this time, a
-request is not sent if the late reply could also be its reply: if both replies have the same frame
-type, and no field in which they must differ. If the late reply arrives, it is counted in `late`,
-and the waiting request is sent. After twice the timeout, only the fields in `matches` or `echoes`
-distinguish a late reply from the reply to a later request. A frame that arrived before a request
-was sent is never its reply.
+A late reply must not be taken for the reply to the next request. After a timeout, the session
+therefore expects the late reply for the same time again. During this time, it delays requests whose
+reply could not be distinguished from the late reply. Later, only the fields in `matches` or
+`echoes` distinguish the two replies.
 
-A running number (`Count`) is filled in when a request is made, so a command that is sent again has
-the same number. With `echoes`, this number distinguishes the reply from all other replies. A value
-that an earlier reply provides is filled in when the command is sent, because that reply may still
-be on its way. The owner of the session configures the sensor with the options that a reply reports.
+A running number (`Count`) is set when a request is made, so repetitions of the command have the
+same number. A value from an earlier reply is set when the command is sent.
 """
 
 from __future__ import annotations
@@ -64,8 +57,8 @@ class Reply:
         values: the fields of the frame as raw wire integers, as returned by `Sensor.parse`;
             ``reply["path"]`` is the physical value.
         confirmed: whether the device replied.
-        at: the arrival time by the session's clock, ns; if `confirmed` is False, the time when the
-            command was sent.
+        at: the arrival time by the session's clock, ns; the time of sending if `confirmed` is
+            False.
         data: the bytes of the frame.
         fields: the fields of the frame type, by path.
     """
@@ -131,7 +124,7 @@ class PendingReply:
 
         Raises:
             ReplyTimeout: if no reply arrived in time.
-            CommandError: if the device sent another reply or refused, or if the command was
+            CommandError: if the device refused or sent another reply, or if the command was
                 abandoned.
             UsageError: if the command is not done.
         """
@@ -151,11 +144,9 @@ class ExpectedReply:
     """The frames that can be the reply to one request.
 
     Attributes:
-        tables: the frame types of the possible replies, with their fields: frame type -> path ->
-            field.
-        matches: the values that the reply must have: path -> value. Paths that a frame type does
-            not have are ignored.
-        echoes: the values that the reply or a refusal must have in addition, like `matches`.
+        tables: frame type of a possible reply -> path -> field.
+        matches: path -> value that the reply must have, if its frame type has this path.
+        echoes: path -> value that the reply or a refusal must have in addition, like `matches`.
         refusal: the frame type of a refusal; None if the sensor sends no refusals.
     """
 
@@ -170,9 +161,9 @@ class ExpectedReply:
         return {**self.matches, **self.echoes}
 
     def find_differences(self, frame: str, values: Any) -> list[str]:
-        """Return a list of the differences between a frame and the expected reply.
+        """Return texts that describe how a frame differs from the expected reply.
 
-        Each item is a text; the list is empty if the frame can be the reply.
+        The list is empty if the frame can be the reply.
         """
         if frame not in self.tables:
             return [f"a {frame} frame"]
@@ -212,10 +203,7 @@ class ExpectedReply:
 
 
 def get_nested(values: Any, path: str) -> Any:
-    """Return the value at a path of a parsed frame; `_MISSING` if there is none.
-
-    If the path leads through an array without an index, the result is a list of values.
-    """
+    """Return the value at a path of a parsed frame; `_MISSING` if there is none."""
     for name in split_path(path):
         if isinstance(name, int):
             if isinstance(values, list) and name < len(values):
@@ -252,12 +240,11 @@ class _PendingCommand:
     """A command in progress.
 
     Attributes:
-        data: the bytes of the command. Before the command is sent, the values that an earlier reply
-            provides are missing.
-        arguments: the arguments, and the values that were filled in when the command was requested.
-        timeout: time from the first sending until the command fails, ns.
+        data: the bytes of the command; values from earlier replies may be missing.
+        arguments: the arguments, with values that the session has added.
+        timeout: time from the first sending to the failure of the command, ns.
         sent: the times of all sendings, ns.
-        wrong: a description of the last frame that had the type of the reply, but wrong values.
+        wrong: a description of the last frame with the type of the reply, but wrong values.
     """
 
     name: str
@@ -304,7 +291,7 @@ class _LinkQueue:
         queue: requests that were not sent yet.
         current: the sent request that waits for its reply.
         late_replies: replies that may still arrive after their timeout.
-        quiet_until: time before which nothing is sent because the device settles, ns.
+        quiet_until: time until which nothing is sent, ns.
     """
 
     queue: deque[_PendingCommand] = field(default_factory=deque)
@@ -334,7 +321,6 @@ class _Heartbeat:
     """A command that is sent regularly.
 
     Attributes:
-        arguments: the arguments of the command.
         due: the time of the next sending, ns.
         pending: the reply to the last sending.
     """
@@ -347,18 +333,17 @@ class _Heartbeat:
 class Session:
     """The commands of one sensor on its links.
 
-    Pass every arriving frame to `receive`, including the frames that `Decoder.idle` returns when
-    the link falls silent. If a device stops in the middle of a data frame, the decoder finds the
-    reply after the incomplete frame only when `idle` is called.
+    Pass every arriving frame to `receive`, and the frames that `Decoder.idle` returns when the link
+    falls silent. Without `idle`, a reply after an incomplete frame is not found.
 
     Attributes:
         sensor: the sensor.
-        started: whether the sensor was started, and was not stopped afterwards.
+        started: whether the sensor was started, and not stopped since.
         late: number of replies that arrived after their timeout.
         unanswered: heartbeat commands without a reply, and their errors.
         host: the address of this computer as seen by the sensor; None if unknown.
         port: the port at which this computer expects the data; None if unknown.
-        provided: the values that replies have provided (`Command.provides`), by name.
+        provided: name in `Command.provides` -> value from a reply.
     """
 
     def __init__(self, sensor: Sensor) -> None:
@@ -427,10 +412,7 @@ class Session:
         return out
 
     def awaited_frames(self, link: str = "data") -> frozenset[str]:
-        """Return the frame types of a link that can be replies.
-
-        `receive` ignores all other types.
-        """
+        """Return the frame types of a link that can be replies."""
         line = self._lines.get(link)
         if line is None:
             return frozenset()
@@ -494,8 +476,6 @@ class Session:
     def abandon(self, reason: str, link: str | None = None) -> None:
         """Fail all requests and stop all heartbeats.
 
-        If a reply arrives later, it is still recognised as late.
-
         Args:
             reason: the text of the error.
             link: the link on which requests fail; None for all links.
@@ -518,10 +498,7 @@ class Session:
                 request.pending.settle(CommandError(f"{self.sensor.id} {request.name}: {reason}"))
 
     def _fill_values(self, command: Command) -> dict[str, Any]:
-        """Return the values of a command that are determined when it is requested.
-
-        They are the next running numbers, and the address and the port of this computer.
-        """
+        """Return running numbers, and the address and port of this computer."""
         filled: dict[str, Any] = {}
         for path, value in command.filled.items():
             if isinstance(value, Count):
@@ -623,12 +600,10 @@ class Session:
     def _use_refusal(self, line: _LinkQueue, item: Found, values: Any, now: int) -> bool:
         """Fail the oldest unanswered request if a frame is a refusal.
 
-        A refusal may contain nothing that identifies the refused request. Therefore, the oldest
-        request whose `echoes` it does not contradict is assumed.
-
         Returns:
             Whether the frame is a refusal.
         """
+        # a refusal may not identify its request: assume the oldest that it does not contradict
         refused = next(
             (late for late in line.late_replies if late.expected.is_refusal(item.frame, values)),
             None,
@@ -665,16 +640,11 @@ class Session:
     def _free_link(
         self, line: _LinkQueue, request: _PendingCommand, *, reply_count: int, since: int
     ) -> None:
-        """End the current request of a link, so that the next request can be sent.
-
-        If the command was sent more often than replies have arrived, the missing replies are added
-        to `late_replies`.
+        """End the current request of a link, and expect its missing replies later.
 
         Args:
-            line: the queue of the link.
-            request: the current request.
             reply_count: number of replies that have arrived, 0 or 1.
-            since: the time at which the settling time of the device begins, ns.
+            since: the time from which the device settles, ns.
         """
         line.current = None
         line.quiet_until = since + _to_ns(request.command.settle)
@@ -686,9 +656,7 @@ class Session:
 
 
 def learn_options(sensor: Sensor, reply: Reply) -> dict[str, Any]:
-    """Return the options that a reply reports, by name.
-
-    The result is empty if the command declares no `learns`, or if the reply is not confirmed.
+    """Return the options that a confirmed reply reports, by name.
 
     Raises:
         CommandError: if `learns` raises, or returns an invalid option.
@@ -722,7 +690,7 @@ def provided_values(sensor: Sensor, reply: Reply) -> dict[str, Any]:
     """Return the values that a reply provides for later commands, by name.
 
     Raises:
-        CommandError: if `provides` raises, or returns a value that is not a text or number.
+        CommandError: if `provides` raises, or returns an invalid value.
     """
     provides = sensor.commands[reply.command].provides
     if provides is None:

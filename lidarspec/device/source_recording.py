@@ -1,11 +1,10 @@
 """Record a source to a file.
 
 A live source is recorded until a limit is reached or the caller stops. A file is copied as fast as
-the disk allows.
+possible.
 
-If the sensor of a live source is known, a `Device` starts and stops the sensor, and decodes the
-data to count packets. Otherwise a `CaptureThread` reads the source, and nothing is sent. The
-recorder is made after the source is opened, because the format depends on the source.
+If the sensor of a live source is known, a `Device` starts the sensor and counts its packets.
+Otherwise, nothing is sent.
 """
 
 from __future__ import annotations
@@ -44,12 +43,10 @@ def make_recorder(
 ) -> BackgroundWriter:
     """Create a recording for a source, and return the recorder that writes it.
 
-    If the source is itself a recording, the sensor, source and baud rate in its header are copied
-    to the header of the new recording.
+    If the source is itself a recording, its header is copied.
 
     Args:
-        opened: the source, already opened.
-        source: the source as the user named it, which is stored in the header.
+        source: the SOURCE, which is stored in the header.
         target: the path of the new file.
         sensor: the sensor, or its id; None if unknown.
         overwrite: whether the file may exist.
@@ -72,18 +69,16 @@ def make_recorder(
 
 
 class LimitedRecorder:
-    """A recorder with a time limit, which is counted from the first arrival.
-
-    Sent data is recorded without limit.
+    """A recorder with a time limit for arriving data.
 
     Args:
-        recorder: writes the file; closed with this object.
-        seconds: the time limit; None for no limit.
+        recorder: writes the file. `close` closes it.
+        seconds: the time limit, counted from the first arrival; None for no limit.
 
     Attributes:
         first: arrival time of the first recorded chunk, ns; None if nothing has arrived.
         last: arrival time of the last recorded chunk, ns; None if nothing has arrived.
-        is_over: whether the limit has passed, so that further arrivals are ignored.
+        is_over: whether the time limit has passed.
     """
 
     def __init__(self, recorder: BackgroundWriter, seconds: float | None) -> None:
@@ -150,7 +145,7 @@ class SourceRecording:
     """Records everything that a source sends to one file.
 
     Args:
-        source: the path or URL of the source, as for `lidarspec.open`.
+        source: the SOURCE, as for `lidarspec.open`.
         target: an .lsr, .pcap, .pcapng or .bin file.
         sensor: the sensor; None to record raw bytes.
         seconds: the time limit, counted from the opening of a live source, or from the first
@@ -163,11 +158,9 @@ class SourceRecording:
 
     Attributes:
         recorder: writes the file; None before the source is open.
-        device: reads a live source; None if its sensor is unknown.
-        packets: number of data packets so far, or of datagrams if the sensor is unknown; at the
-            end, the number in the file.
-        elapsed: seconds since the source was opened; at the end, the seconds between the first and
-            the last arrival in the file, if it contains arrival times.
+        packets: number of data packets so far, or of datagrams if the sensor is unknown.
+        elapsed: seconds since the source was opened. At the end, the duration of the recording in
+            seconds, if it has arrival times.
     """
 
     def __init__(
@@ -201,8 +194,7 @@ class SourceRecording:
     def run(self) -> Generator[str, None, None]:
         """Record until the end or a limit; yield messages.
 
-        If there is no message, "" is yielded, so that the caller can show the progress: every
-        `CHECK_PERIOD_S` for a live source, and after each chunk of a file.
+        "" is yielded regularly instead of a message, so that the caller can show the progress.
 
         Raises:
             UsageError: if the file exists, or its format cannot contain the data of the source.
@@ -213,10 +205,7 @@ class SourceRecording:
         return self._record_undecoded()
 
     def _record_device(self, sensor: Sensor) -> Generator[str, None, None]:
-        """Record the data of a sensor, and decode it to count packets.
-
-        A thread records, so that errors of decoding do not stop the recording.
-        """
+        """Record the data of a sensor in a thread, and decode it to count packets."""
         device_warnings = list[str]()  # kept for the case that decoding fails
         failures = list[str]()
         with Device(
@@ -258,11 +247,7 @@ class SourceRecording:
             pass
 
     def _count_next(self, device: Device, log: LimitedRecorder) -> bool:
-        """Count the next packets of the device that were written to the file.
-
-        Returns:
-            False if there are no more packets in the file.
-        """
+        """Count recorded packets of the device; return False at their end."""
         arrived = _read_arrival_times(device)
         if len(arrived) == 0:
             return False
@@ -318,11 +303,7 @@ class SourceRecording:
     def _count_queued(
         self, source: LiveTransport, queue: BoundedQueue, log: LimitedRecorder, wait: float
     ) -> list[LinkEvent]:
-        """Take everything from the queue, and count the recorded datagrams.
-
-        Returns:
-            The events that are not data, such as a lost device.
-        """
+        """Empty the queue and count the recorded datagrams; return all other events."""
         events = list[LinkEvent]()
         for _, item in queue.take(wait):
             if isinstance(item, BaseException):
@@ -334,7 +315,7 @@ class SourceRecording:
         return events
 
     def _copy(self, source: Transport, log: LimitedRecorder) -> Generator[str, None, None]:
-        """Copy a file. Data from standard input is recorded with its time of arrival."""
+        """Copy a file. Data from standard input has its time of arrival."""
         clock = HostClock()
         assert self.recorder is not None
         try:
@@ -356,8 +337,7 @@ class SourceRecording:
         """Create the recorder of an open source, and start to measure `elapsed`.
 
         Raises:
-            UsageError: if the packets of the source cannot be counted, but `count` is given, and
-                for the errors of `make_recorder`.
+            UsageError: if the packets cannot be counted for `count`, and as for `make_recorder`.
             SourceError: if the file cannot be created.
         """
         is_decoded = sensor is not None and isinstance(source, LiveTransport)
@@ -378,7 +358,7 @@ class SourceRecording:
         """Update `elapsed`, and return whether a limit is reached.
 
         Args:
-            is_timed: whether the time limit applies, in addition to the maximum count.
+            is_timed: whether the time limit applies.
 
         Raises:
             SourceError: if the recorder has failed.
@@ -396,10 +376,7 @@ class SourceRecording:
 
 
 def _read_arrival_times(device: Device) -> NDArray[np.int64]:
-    """Return the arrival times of the next packets, (n,) ns since 1970.
-
-    If the sensor has no points, they are the arrival times of `Sensor.main_frames`.
-    """
+    """Return the arrival times of the next packets, (n,) ns since 1970."""
     if device.sensor.has_points:
         packets = next(device.packets(wait=CHECK_PERIOD_S), None)
         batches = [] if packets is None else [packets]
