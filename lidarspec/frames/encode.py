@@ -57,7 +57,6 @@ def encode(layouts: LayoutLookup, given: Container, place: str) -> bytes:
     """Return the bytes of a frame.
 
     Args:
-        layouts: the layouts of the frame type.
         given: the raw values by name, nested as in the struct. Missing values are added to it.
         place: the names of sensor and frame, for messages.
 

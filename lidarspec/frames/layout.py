@@ -119,11 +119,7 @@ class Leaf:
     elements: tuple[BitField, ...] = ()
 
     def load(self, rows: Bytes2D) -> NDArray[Any]:
-        """Return the raw values of the field, (n, *shape), in native byte order.
-
-        Args:
-            rows: the frames, (n, size).
-        """
+        """Return the raw values of the field, (n, *shape), in native byte order."""
         if self.wire is not None:
             return self._view(rows, self.wire, 0).astype(self._native)
         assert self.info.dtype is not None
@@ -170,10 +166,7 @@ class Leaf:
         return which, self._from_start.load(gather_rows(buffer, starts, self.size))
 
     def read_first(self, frame: bytes | memoryview) -> int | None:
-        """Return the value of the field, given the first bytes of a frame.
-
-        Returns None if the bytes end before the end of the field.
-        """
+        """Return the value of the field; None if the frame is cut off before its end."""
         if self.offset + self.size <= len(frame):
             return self.read_scalar(frame)
         return None
@@ -668,10 +661,7 @@ class Layout:
         return sum(value << 8 * offset for offset, (_, value) in self.known.items())
 
     def column(self, path: str) -> Leaf | Derivation | None:
-        """Return the position of a field, or the `Derivation` of a derived value.
-
-        Returns None if the layout does not have the field.
-        """
+        """Return the position of a field or derived value; None if the layout lacks it."""
         return self.leaves.get(path) or self.derived.get(path)
 
     def load(self, path: str, rows: Bytes2D) -> NDArray[Any]:
@@ -683,10 +673,7 @@ class Layout:
         return found.load(rows)
 
     def is_valid(self, frame: bytes) -> bool:
-        """Return whether one frame is valid.
-
-        This checks the size, constants, checksums and conditions of the frame.
-        """
+        """Return whether size, constants, checksums and conditions of a frame are valid."""
         return (
             len(frame) == self.size
             and int.from_bytes(frame, "little") & self._mask == self._value

@@ -98,8 +98,7 @@ def walk_layout(walk: HeaderWalk, root: tree.Node) -> Layout:
 def find_prefix(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
     """Return the constants at offsets that depend on no header field.
 
-    Returns:
-        The constant bits, as (mask, value) by offset.
+    The constants are given as (mask, value) by offset.
     """
     walk = HeaderWalk({}, limit)
     # If an expression of the struct fails, the constants before it are still known.
@@ -795,7 +794,6 @@ class HeaderTree:
     """All layouts of one frame type or kind of parts.
 
     Attributes:
-        root: the frame type or kind of parts.
         limit: the maximum size of a frame, in bytes.
     """
 
@@ -848,7 +846,7 @@ class HeaderTree:
 
         Args:
             read: a function that reads the field of a node for some candidates.
-            places: the bytes of the candidates; None if the bytes are available only to `read`.
+            places: the bytes of the candidates, if they are available.
         """
         self._limit_cache()
         groups: list[Group] = []
@@ -920,9 +918,9 @@ class HeaderTree:
     def find_node(
         self, frame: bytes, *, since: HeaderNode | None = None, is_whole_frame: bool = False
     ) -> HeaderNode:
-        """Return the node to which the available bytes of a frame lead.
+        """Return the node that the available bytes of a frame determine.
 
-        If the bytes do not determine the layout, the node has no result.
+        The node has no result if more bytes are needed.
 
         Args:
             since: the node that was returned for fewer bytes of this frame, to continue from.
@@ -943,11 +941,7 @@ class HeaderTree:
         return self._find_end(frame, self._root).result
 
     def layout_for(self, read: Callable[[Leaf | MeasuredSize], int]) -> Layout:
-        """Return the layout for given values of header fields.
-
-        Args:
-            read: a function that returns the value of a header field that the layout depends on.
-        """
+        """Return the layout for given values of header fields."""
         self._limit_cache()
         node = self._root
         while node.result is None:

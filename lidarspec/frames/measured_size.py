@@ -86,7 +86,6 @@ class TextSize(MeasuredSize):
     Attributes:
         ending: the mark.
         start: the offset of the bytes in a frame.
-        limit: the maximum size of a frame, in bytes.
     """
 
     ending: tree.Ending

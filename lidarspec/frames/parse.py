@@ -1,7 +1,7 @@
 """Parse one frame into a Container of raw values.
 
-A valid frame is read by its layout. For an invalid frame, a `WireError` with its first fault is
-raised. construct parses frames that have no layout (`lidarspec.frames.plain`).
+A valid frame is read by its layout. construct parses frames that have no layout
+(`lidarspec.frames.plain`).
 """
 
 from __future__ import annotations
@@ -599,7 +599,7 @@ def find_frame_layout(
 ) -> Layout | LayoutRefusal | None:
     """Return the layout of one frame, or the refusal of its header.
 
-    Returns None if the frame type cannot be compiled, or if the header is incomplete.
+    Returns None if the frame type has no layouts, or if the header is incomplete.
     """
     layouts = frame_layouts(sensor.frames[name])
     if isinstance(layouts, NotCompilableError):

@@ -58,17 +58,10 @@ class LayoutLookup(Protocol):
         Args:
             stops: the offset after the last byte of each candidate; by default the end of the
                 buffer.
-
-        Returns:
-            Pairs of a layout or refusal and the indices of its candidates.
         """
 
     def layout_for(self, read: Callable[[Leaf | MeasuredSize], int]) -> Layout:
-        """Return the layout for given values of header fields.
-
-        Args:
-            read: a function that returns the value of a header field that the layout depends on.
-        """
+        """Return the layout for given values of header fields."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,10 +318,7 @@ class _PartWalk:
     def _match_constants(
         self, which: Offsets, constants: tuple[Word, ...]
     ) -> NDArray[np.bool_] | None:
-        """Return whether the next part of each frame has these constants, (k,).
-
-        Returns None if all of the parts have the constants.
-        """
+        """Return whether the next part of each frame has the constants; None if all have."""
         if constants:
             return match_constants_at(
                 self._buffer, self._ends[which], constants, self._select_stops(which)

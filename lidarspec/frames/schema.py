@@ -192,11 +192,10 @@ class Schema:
     def split_part_path(self, path: str) -> tuple[str, str, str] | None:
         """Split a path into a sequence of parts, a kind of part, and a field in the part.
 
-        Returns None if the path is not in a sequence of parts.
+        Returns None for all other paths.
 
         Raises:
-            UnknownField: if the sequence has several kinds of parts, and the path does not name
-                one.
+            UnknownField: if the path does not name one of several kinds of parts.
         """
         for axis, node in self.separate_parts.items():
             if path == axis or path.startswith(f"{axis}."):

@@ -87,11 +87,7 @@ class Coder:
         return values
 
     def find_size(self, data: bytes) -> int | None:
-        """Return the size of the frame at the start of `data`.
-
-        Returns None if the size has to be found by the layout, or if the end of the frame is
-        missing.
-        """
+        """Return the size of the frame at the start of `data`; None if it is unknown."""
         return None
 
     def make_encodable(self, rows: Bytes2D, layout: Layout) -> None:
@@ -218,10 +214,7 @@ class FormCoder(Coder):
         return None
 
     def encode_unchecked(self, struct: bytes) -> bytes | None:
-        """Return the bytes that the wire form sends for a struct, even if they are invalid.
-
-        Returns None if the struct has no layout.
-        """
+        """Encode a struct without checking the result; None if it has no layout."""
         layout = self.tree.find_node(struct, is_whole_frame=True).result
         if not isinstance(layout, Layout) or layout.size != len(struct):
             return None

@@ -369,10 +369,7 @@ def format_unit(info: tree.FieldInfo) -> str:
 
 
 def describe_field(info: tree.FieldInfo) -> str:
-    """Return the description of a field.
-
-    The description has the constant, the formula of the value, the documentation and the labels.
-    """
+    """Return the constant, formula, documentation and labels of a field as a text."""
     if info.const is not None:
         const = f"always {format_hex(info.const, info.bits)}"
     else:
