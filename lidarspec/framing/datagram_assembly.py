@@ -88,7 +88,6 @@ class FragmentAssembler:
     """Joins the fragments of one link to messages.
 
     Args:
-        rule: the declaration of the fields of a fragment.
         longest: the maximum size of a message in bytes.
         stats: the counters, which include lost and late fragments.
 
@@ -124,7 +123,6 @@ class FragmentAssembler:
         """Add datagrams; return completed messages, and datagrams that are not fragments.
 
         Args:
-            buffer: the bytes that contain the datagrams.
             starts: the offset of each datagram in the buffer.
             sizes: the size of each datagram in bytes.
             at: the arrival times, ns.
@@ -192,10 +190,7 @@ class FragmentAssembler:
         return None
 
     def _store(self, fragment: _Fragment, place: int, time: int) -> tuple[bytes, int] | None:
-        """Store a fragment and return the message that it completes, with its offset.
-
-        Returns None if other fragments are missing.
-        """
+        """Store a fragment; return the message that it completes and its offset."""
         for key in [
             key for key, message in self._waiting.items() if 0 <= message.at < time - MAX_WAIT_NS
         ]:

@@ -37,7 +37,6 @@ def sort_datagrams(
     """Find the type of each datagram.
 
     Args:
-        buffer: the bytes that contain the datagrams.
         starts: the offset of each datagram in the buffer, in the order of arrival.
         sizes: the size of each datagram in bytes.
         mode: the state between batches, which is updated.

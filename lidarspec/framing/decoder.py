@@ -242,8 +242,6 @@ class Decoder:
     ) -> Frames:
         """Return the frames in datagrams that are in one buffer, without copying them.
 
-        Each datagram is one whole frame or invalid.
-
         Args:
             buffer: the bytes, one-dimensional and contiguous; bytes between datagrams are ignored.
             starts: the offset of each datagram in the buffer, in the order of arrival.

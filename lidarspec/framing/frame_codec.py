@@ -1,9 +1,4 @@
-"""`Codec`: the interface for checking candidates and making columns of one frame type.
-
-It is implemented for binary frames with layouts (`lidarspec.framing.frame_engine`), for frames with
-a wire form (`lidarspec.framing.text_frames`), and for frames without layouts
-(`lidarspec.framing.plain_frames`).
-"""
+"""`Codec`: the interface for checking candidates and making columns of one frame type."""
 
 from __future__ import annotations
 
@@ -67,14 +62,13 @@ class Codec:
     def survey_rows(
         self, rows: NDArray[np.uint8], *, sums: Sums | None = None
     ) -> tuple[Layout, Status, tuple[PluginError, ...]] | None:
-        """Check candidates of one size, if they have a common layout.
+        """Check candidates of one size; None if they have no common layout.
 
         Args:
             rows: the candidates, (n, size).
 
         Returns:
-            The common layout, the status of each candidate, and the errors of the plugin. None if
-            the candidates do not have a common layout.
+            The common layout, the status of each candidate, and the errors of the plugin.
         """
         return None
 

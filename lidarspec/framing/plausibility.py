@@ -72,8 +72,7 @@ class CandidateChecker:
 
     Attributes:
         checks: `struct_checks` and `plausibility_checks`.
-        is_complete: whether `checks` contains all conditions, so that the plausibility function
-            need not be called.
+        is_complete: whether the plausibility function need not be called.
     """
 
     def __init__(

@@ -25,9 +25,7 @@ DISTINCTIVE_CONSTANTS = 4
 def find_regular_frames(
     framing: Framing, buffer: NDArray[np.uint8], mode: SearchState, base: int
 ) -> PieceResult | None:
-    """Return the frames that follow one another at the start of a piece.
-
-    Returns None if the piece must be searched.
+    """Return the frames at the start of a piece; None if the piece must be searched.
 
     Args:
         buffer: the bytes that the last search left undecided, and the new bytes.
@@ -86,9 +84,7 @@ def find_regular_datagrams(
 def check_rows(
     framing: Framing, kind: int, buffer: NDArray[np.uint8], rows: Bytes2D, first: int
 ) -> Frames | None:
-    """Check rows as candidates of one type and one layout.
-
-    Returns None if the rows do not have a common layout.
+    """Check rows as candidates of one type; None if they have no common layout.
 
     Args:
         kind: the index of the type, whose constants match in all rows.

@@ -364,7 +364,6 @@ class Frames:
         """Return these frames with their offsets in the input and their arrival times.
 
         Args:
-            names: the names of the frame types, as in `Frames`.
             places: the offset of each frame in the input, (n,).
             gaps: the number of bytes skipped before each frame, (n,).
             at: the arrival time of each frame, ns, (n,).

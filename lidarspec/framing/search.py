@@ -41,7 +41,7 @@ def find_frames(
         buffer: the bytes that the last search left undecided, and the new bytes.
         mode: the state between pieces, which is updated.
         base: the offset of the buffer in the stream.
-        final: whether the stream ends with this piece; incomplete candidates are then rejected.
+        final: whether the stream ends with this piece, so that incomplete candidates are rejected.
     """
     candidates = Candidates(framing, buffer, mode, final=final)
     piece = PieceResult(Frames.make_empty(candidates.buffer), len(candidates.buffer))

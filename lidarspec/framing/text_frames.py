@@ -136,7 +136,7 @@ class TextCodec(Codec):
     def _decode(self, data: bytes, errors: list[PluginError]) -> tuple[int, bytes | None]:
         """Decode a complete candidate; return its status and its struct.
 
-        If the struct is not None, the caller has to check it.
+        The caller has to check the struct, if there is one.
         """
         try:
             decoded = self._coder.decode_whole(data)
