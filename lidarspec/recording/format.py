@@ -3,7 +3,7 @@
 A recording is a sequence of independent records. The first is the header, in JSON.
 
     offset  size  of a record, little-endian
-    0       4     mark b"\xb5LS\x1e"
+    0       4     mark, the bytes B5 4C 53 1E
     4       1     kind: 0 header, 1 received, 2 sent, 3 event
     5       1     flags: 1 the data is a datagram, 2 the line was interrupted before
                   the record, 4 the line was silent before the record

@@ -181,7 +181,6 @@ class FrameRecorder(BackgroundWriter):
     order.
 
     Args:
-        path: the file.
         sensor: the sensor that declares the frames.
         overwrite: whether an existing file may be replaced.
     """
@@ -270,7 +269,6 @@ def open_recorder(
     """Open the recorder for a file; its suffix is .lsr, .pcap, .pcapng or .bin.
 
     Args:
-        path: the file.
         sensor: the sensor if it is known. A capture of a byte stream requires it.
         source: the source of the data, for the header of an .lsr file.
         datagrams: whether chunks are datagrams, not portions of a byte stream.
