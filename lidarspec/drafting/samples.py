@@ -116,7 +116,6 @@ class ChecksumMatch:
 
     Attributes:
         place: the offset and size of the checksum in the frames.
-        span: the covered bytes.
         right: the number of frames with a valid checksum.
         evidence_bits: the certainty: of 2**evidence_bits wrong checksums, one matches by
             coincidence.
