@@ -64,7 +64,7 @@ def select_frame(sensor: Sensor, frame: str) -> Sensor:
 
 
 def make_prefix(sensor: Sensor) -> str:
-    """Return the id for use in names that must begin with a letter."""
+    """Return a prefix for names that must begin with a letter, made from the id."""
     if sensor.id[0].isalpha():
         return sensor.id
     return f"lidar-{sensor.id}"

@@ -163,7 +163,7 @@ FLOAT_SIZES = (4, 8)
 def make_block_type(
     block: tree.Block, doc: Callable[[tree.FieldInfo], Attribute]
 ) -> tuple[list[Attribute], dict[str, Attribute]]:
-    """Return the attributes and the instances of the Kaitai type of a bit block.
+    """Return the attributes and the instances of a bit block's Kaitai type.
 
     Args:
         doc: a function that returns the documentation of a field.
@@ -634,7 +634,7 @@ def _format_size(formula: tree.Formula, scope: Scope) -> int | str:
 
 
 def _name_value(node: tree.Node) -> tree.Node:
-    """Return an array element or an alternative with the name `value`."""
+    """Return an array element or an alternative, renamed to `value`."""
     if isinstance(node, tree.Number):
         parent = node.info.path.rpartition(".")[0]
         return replace(node, info=replace(node.info, path=f"{parent}.value" if parent else "value"))

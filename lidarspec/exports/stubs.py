@@ -92,7 +92,6 @@ class _StubClasses:
     """The classes of a stub while it is written.
 
     Attributes:
-        taken: the class names in use.
         done: the text of each class, inner classes first.
     """
 
