@@ -186,7 +186,6 @@ class ExplainedRow:
     Attributes:
         offset: offset of the first byte in the frame.
         path: the path of the field or element; "" for bytes that are not in a field.
-        values: the fields in these bytes.
         remarks: remarks on constants, checksums and missing bytes.
         matches_spec: whether the bytes match the spec.
         points: the points in this element.
