@@ -7,7 +7,7 @@ and its data sheet A00; TF-Luna manual A05, section 5, appendices I and II. The 
 sends the same frames with other data in place of the temperature, and has other commands. Distances
 are in centimetres by default. Frames do not contain the unit, so use ``configure(unit="mm")`` after
 the command `set_unit_mm`. Text formats and formats with a time are not supported. A TF-Luna ignores
-the checksum of commands, so its manual prints commands with the checksum 00. The TFmini-S manual
+the checksum of commands, and its manual prints commands with the checksum 00. The TFmini-S manual
 prints the replies to reset, factory settings and save with the checksums of their commands.
 """
 

@@ -310,7 +310,6 @@ class RotationSweep:
     Attributes:
         hertz: revolutions per second.
         steps: points per revolution.
-        exposure: the exposure at the beginning.
         previous_values: the values of the packets that complete the previous revolution, which has
             another speed.
         exposure_follows_speed: whether the exposure follows the speed, as on an M1C1_Mini.

@@ -38,8 +38,6 @@ class Column:
     Attributes:
         name: the name of the column in messages.
         headings: the accepted headings, in lower case and without parentheses.
-        low: the lowest accepted value.
-        high: the highest accepted value.
         units: the accepted spellings of the unit, which may follow the heading in parentheses.
     """
 

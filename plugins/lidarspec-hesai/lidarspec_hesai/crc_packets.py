@@ -97,7 +97,6 @@ def make_packet(
     """Return the struct of a packet of a protocol version.
 
     Args:
-        channels: the array of channels in a block.
         tail: the fields between functional safety and sequence.
         block: the type of the fine azimuth, which is between azimuth and channels; None if blocks
             have no fine azimuth.

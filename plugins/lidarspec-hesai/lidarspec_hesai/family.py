@@ -25,7 +25,6 @@ def make_spinning_sensor(
 
     Args:
         points: a function that returns points, given `Fields` and the unit's `Calibration`.
-        table: the nominal corrections of the model.
         sweep: a function that returns the values of simulated packet i.
         azimuth: the path of the field that passes 0 at the end of a scan.
     """

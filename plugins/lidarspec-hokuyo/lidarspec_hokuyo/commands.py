@@ -202,7 +202,6 @@ def make_commands(kind: str, steps: bytes, *, is_urg: bool) -> dict[str, Command
     Args:
         kind: a key of `SCAN_COMMANDS`.
         steps: the first step, the last step and the cluster size, as in a command.
-        is_urg: whether the scanner is a URG-04LX.
     """
     values = {"start": {"value": steps + b"000"}, "get_scan": {"value": steps}}
     commands = dict[str, Command]()

@@ -139,7 +139,6 @@ def make_points_frame(kind: int, points: Any, *members: Any, **more: Any) -> Fra
     """Return the frame of one type of points.
 
     Args:
-        kind: the data type.
         members: the fields of a shot.
     """
     struct = make_packet(kind, "points" / Array(this.dot_num, Struct(*members)))

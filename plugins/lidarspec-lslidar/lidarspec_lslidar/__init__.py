@@ -305,7 +305,6 @@ class Model:
     Attributes:
         hertz: the lowest and the highest number of revolutions per second.
         clock: the clock in the packets; None if they have no time.
-        status: how the model was verified, as in `Sensor`.
     """
 
     name: str

@@ -207,7 +207,6 @@ class MetadataKeys:
 
     Attributes:
         name: where the metadata are from, for messages.
-        data: the values by key.
     """
 
     name: str

@@ -26,7 +26,6 @@ def make_status(
     Args:
         reading: the statistics of the last second.
         device_warnings: warnings in addition to the warnings of the device.
-        more: further values to report, by name.
     """
     warnings = [*device.warnings, *device_warnings]
     figures = {f"{name} [{unit}]": text(reading) for name, unit, _, text in FIGURES}

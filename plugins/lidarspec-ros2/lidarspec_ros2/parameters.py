@@ -31,7 +31,6 @@ class Parameter:
     """One parameter.
 
     Attributes:
-        name: its name in ROS.
         default: the default value, which also defines the type.
         low, high: the limits of a number.
         live: whether the parameter can be changed while the node is configured.

@@ -52,7 +52,6 @@ class ScannerFamily:
         steps: the possible angular steps in degrees.
         start: the first angle in degrees.
         beams: the number of beams of a simulated scan.
-        echoes: the maximum number of echoes.
         layers: the elevations of the layers in the order in which they are sent, in degrees,
             positive downwards.
     """

@@ -1,8 +1,8 @@
 """Simulated replies of each model: information, scan modes, and the descriptor of each mode.
 
-Source: the information and the mode Sensitivity of the A1 are from the replies of a live A1.
-Everything else is assumed. The times and ranges of the other modes are the values that the vendor's
-SDK prints for similar models. Models are assumed to differ only in the kinds of their capsules.
+Source: replies of a live A1, for its information and its mode Sensitivity. Everything else is
+assumed. The assumed times and ranges of the other modes are the values that the vendor's SDK prints
+for similar models.
 """
 
 from __future__ import annotations

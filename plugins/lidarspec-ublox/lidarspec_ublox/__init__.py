@@ -288,7 +288,7 @@ def utc_time(f: Fields) -> Any:
 
 
 def is_resolved(f: Fields) -> Any:
-    """Return whether date and time are valid, and no second is uncertain."""
+    """Return whether date and time are valid and fully resolved."""
     valid = f.valid
     return (valid.date == 1) & (valid.time == 1) & (valid.fully_resolved == 1)
 

@@ -281,7 +281,6 @@ def make_related_model(id: str, model: str, firings: Firings, **facts: Any) -> S
     """Return another model of the family, derived from the VLP-16.
 
     Args:
-        firings: its firing pattern.
         facts: further arguments of `Sensor` that differ from those of a VLP-16.
     """
     return dataclasses.replace(

@@ -9,7 +9,8 @@ If a packet was lost, the azimuth of the next block is further ahead than the se
 rotated. The same is true after a sector that is masked in the sensor's settings. In these cases,
 and if there is no next block, the user's choice applies:
 
-* "previous", the default: the last valid step is used again, as ros-drivers and nebula do.
+* "previous", the default: the last valid step is used again, as ros-drivers and nebula do for the
+  last block of every packet.
 * "invalid": the firings of the block have no direction, and their points are not valid.
 
 Source: ros-drivers/velodyne rawdata.cc (azimuths); velodyne_decoder packet_decoder.cpp and

@@ -76,12 +76,10 @@ class Broadcast:
 
     Args:
         reopen: a function that opens the source again; called to seek in a file.
-        select: the scans to show; by default all.
         switch: starts and stops recordings of a live source; None for a file.
 
     Attributes:
         shown: the newest scan; None before the first scan.
-        backlog: the newest bytes.
         paused: whether a file is paused.
         speed: speed of a file, relative to real time.
         info: facts about the device, for example its serial number, by name.

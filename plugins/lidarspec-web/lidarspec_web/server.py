@@ -51,7 +51,6 @@ class PageSite:
     Args:
         port: port to listen on; 0 for any free port.
         control: whether pages may send commands to a real sensor.
-        page: the folder with the files of the page; by default the folder in this package.
         report: called with a line for each page that is opened or closed.
 
     Attributes:

@@ -27,7 +27,6 @@ class SourceServer:
         port: port to listen on; 0 for any free port.
         control: whether pages may send commands to a real sensor.
         report: called with a line for each page that is opened or closed.
-        page: the folder with the files of the page; by default the folder in this package.
         folder: the folder for recordings of pages; by default the working directory.
 
     Raises:

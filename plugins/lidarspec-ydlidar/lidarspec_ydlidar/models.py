@@ -24,7 +24,6 @@ class Model:
         is_send_only: whether the model only sends and cannot receive.
         has_state: whether packets that are not zero packets contain the state of the device, in the
             bits of the scan frequency.
-        status: how the model was verified, as in `Sensor`.
     """
 
     sample_format: SampleFormat
