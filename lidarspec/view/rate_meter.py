@@ -15,8 +15,11 @@ from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scan import Scan
 
-#: maximum number of scans that means and medians are calculated from.
+#: Maximum number of scans that means are calculated from.
 MAX_KEPT_SCANS = 1 << 12
+#: A scan whose duration differs from the median by more than this share is not used for the speed:
+#: the end of a scan may be lost.
+MAX_PERIOD_DEVIATION = 0.5
 Seconds = NDArray[np.float64]
 
 
@@ -87,7 +90,7 @@ class RateTally:
         self._totals_before = totals(counters)
         self.scans = 0
         self.packets = 0
-        self._rates = deque[float](maxlen=MAX_KEPT_SCANS)
+        self._periods = deque[float](maxlen=MAX_KEPT_SCANS)
         # The points and the valid points of each scan.
         self._sizes = deque[tuple[int, int]](maxlen=MAX_KEPT_SCANS)
         self._gap_count = 0
@@ -117,8 +120,8 @@ class RateTally:
         """Count a complete scan."""
         self.scans += 1
         self._sizes.append((points, valid))
-        if np.isfinite(rate_hz):
-            self._rates.append(rate_hz)
+        if rate_hz > 0 and np.isfinite(rate_hz):
+            self._periods.append(1 / rate_hz)
 
     def reading(
         self, counters: Counters, *, seconds: float | None, counts_losses: bool
@@ -137,7 +140,7 @@ class RateTally:
         good_bytes = change["bytes_in"] - change["skipped"]
         return MeterReading(
             seconds=duration,
-            speed_hz=float(np.median(self._rates)) if self._rates else None,
+            speed_hz=self._speed(),
             scans=self.scans,
             packets=self.packets,
             packet_rate_hz=self._packet_rate(duration),
@@ -150,6 +153,18 @@ class RateTally:
             longest_gap_s=self._longest_gap if self._has_arrivals else None,
             bytes_per_s=change["bytes_in"] / duration if duration else None,
         )
+
+    def _speed(self) -> float | None:
+        """Return the scans per second; None if unknown.
+
+        Arrival times may be coarse, so a mean is more exact than a median.
+        """
+        if not self._periods:
+            return None
+        periods = np.array(self._periods)
+        median = np.median(periods)
+        is_usual = np.abs(periods - median) <= MAX_PERIOD_DEVIATION * median
+        return float(1 / periods[is_usual].mean())
 
     @property
     def _has_arrivals(self) -> bool:

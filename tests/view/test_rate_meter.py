@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import Decoder, Packets, simulate
+from lidarspec import Counters, Decoder, Packets, simulate
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.stream import ScanStream
-from lidarspec.view.rate_meter import RateMeter
+from lidarspec.view.rate_meter import RateMeter, RateTally
 
 ID = "ldrobot-stl27l"
 FRAMES = 540
@@ -127,3 +127,12 @@ def test_even_arrivals_have_no_jitter() -> None:
         bench.feed(frame, at)
     found = bench.meter.summary(bench.decoder.stats)
     assert found.jitter_s == pytest.approx(0, abs=1e-8)
+
+
+def test_the_speed_is_exact_for_coarse_arrival_times_and_ignores_lost_ends() -> None:
+    tally = RateTally(Counters())
+    # Fifteen scans a second in steps of 10 ms. The end of one scan is lost.
+    for period_ms in [70, 60, 70] * 20 + [130]:
+        tally.add_scan(400, 390, 1000 / period_ms)
+    found = tally.reading(Counters(), seconds=None, counts_losses=False)
+    assert found.speed_hz == pytest.approx(15)
