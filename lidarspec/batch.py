@@ -85,16 +85,12 @@ class FilePiece:
     Attributes:
         source: the path or URL of the file.
         sensor: the sensor's id; "" to detect the sensor.
-        options: the sensor's options, by name.
         target: the path of the output, without the number of the piece; "" without output.
         every_point: whether to include points without a valid return.
-        size: the size of a piece in bytes.
-        select: the selected scans of the file.
         number: the number of the piece in the file, from 0.
         first: the number of the piece's first scan in the file, from 0.
         count: the number of scans in the piece; None for all scans up to the end of the file.
         bookmark: the start of the piece; None for the start of the file.
-        is_last: whether it is the last piece.
     """
 
     source: str

@@ -46,7 +46,6 @@ class ArrivalOrder:
         The index has gaps for lost packets.
 
         Args:
-            batch: the packets.
             times: times by the sensor's clock, (n,) ns; None without a clock.
             skipped: number of bytes outside frames before each packet, (n,).
         """

@@ -78,13 +78,12 @@ class ClockReport:
         locked: whether the clock is locked; None if unknown.
         offset_s: the sensor's time minus the host's, s; nan if unknown. It is too low by the time
             that the fastest packet needs from the sensor to the host.
-        error_s: the difference between the offset and the offset expected for the epoch, s; nan if
-            the clock has no date.
+        error_s: the offset minus the offset expected for the epoch, s; nan if the clock has no
+            date.
         drift_ppm: how much faster the sensor's clock runs than the host's, in millionths; nan if
             unknown.
         jitter_ms: the 95th percentile of the delays of packets, ms. The fastest packets have a
             delay of about 0.
-        packets: number of packets.
         late: the number of packets with a delay of more than 50 ms.
         jumps: how often the clock was set or restarted.
         findings: the findings, the most serious first; at least one.
@@ -124,7 +123,6 @@ class ClockMonitor:
     """Watches the clock of one sensor by its packets.
 
     Args:
-        sensor: the sensor.
         drift_limit_ppm: the drift above which the clock is at fault.
 
     Attributes:

@@ -43,7 +43,6 @@ class RecentPacket:
     """A packet that was received recently.
 
     Attributes:
-        time: the time by the sensor's clock, ns.
         order: the sort key, ns.
         index: the sequence number, with gaps for missing packets.
         missing: the number of packets missing directly before this packet.
@@ -66,7 +65,6 @@ class ClockOrder:
 
     Args:
         stats: counts lost, late and duplicate packets.
-        clock: the clock of the packets.
         gaps: recognizes gaps at masked sectors; None to count all gaps as losses.
     """
 

@@ -92,7 +92,6 @@ class ClockEpoch:
 
     Args:
         sensor: the sensor that declares the clock.
-        clock: the clock.
         reference: a date that applies from the first packet on; None if unknown.
 
     Attributes:
@@ -118,7 +117,6 @@ class ClockEpoch:
         """Return the offset to add to the times of packets, (n,) ns; 0 if unknown.
 
         Args:
-            batch: the packets.
             readings: the readings of the clock, (n,) ns.
             times: the same readings, unwrapped, (n,) ns.
             host: arrival times, (n,) ns; 0 if unknown.
@@ -290,7 +288,6 @@ def part_times(
 
     Args:
         place: the axis and the kind of the parts.
-        table: the parts.
         which: the row of the frame of each part, (k,).
         times: for each part, the time of its frame, (k,).
     """

@@ -4,8 +4,7 @@
 packets. A late packet fills the gap that was left for it.
 
 If the pace of the clock is declared, the clock shows how often the counter wrapped in a gap, and
-whether a value of the counter is corrupt. Without a pace, the loss of a whole period of the counter
-is not found.
+whether a value of the counter is corrupt.
 """
 
 from __future__ import annotations
@@ -310,7 +309,7 @@ class CounterOrder:
         return ahead
 
     def _correct(self, number: int, time: int, pace: float, by_clock: float) -> tuple[int, int]:
-        """Return the places to advance by the clock, and the corrected counter."""
+        """Return the number of places ahead by the clock, and the corrected counter."""
         # A sensor that has reset its counter contradicts the clock again and again. Its counter is
         # not corrected.
         ahead = max(round(by_clock), 1)

@@ -179,7 +179,7 @@ class SectorFinder:
 
         Returns:
             The earlier gaps at the same sector, numbered from the newest gap, which is 1; empty
-                without a sector.
+            without a sector.
         """
         gap = Sector.between(start, stop, self.direction)
         for other in reversed(self._gaps):

@@ -19,8 +19,6 @@ class PacketType:
     """The timing and loss rules of one frame type of a sensor.
 
     Attributes:
-        sensor: the sensor.
-        frame: the name of the frame type.
         codec: parses frames of the type.
         others: the names of the other frame types that packets of this type need as their state.
         clock: the clock of the packets; None without a clock.
@@ -28,7 +26,6 @@ class PacketType:
         loss_clock: the clock that shows losses; None if there is no such clock.
         loss_clock_step_ns: the resolution of `loss_clock`, ns; 0 if a function computes the clock.
         clock_of_counter: the clock that checks the packet counter; None if there is no such clock.
-        is_counted: whether the packets have a counter.
         is_ordered_by_clock: whether the packets are datagrams that have a clock but no counter.
     """
 

@@ -154,7 +154,7 @@ def _place_by_return_index(
     members: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
     numbers: NDArray[np.uint8],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return `members`, with the return index of each packet as its position.
+    """Return `members`, with each position replaced by the packet's return index.
 
     Args:
         members: for each packet, its group, its position in the group, and the size of the group,

@@ -45,7 +45,6 @@ class PacketStream:
     """Makes packets of one type from the frames that a decoder finds.
 
     Args:
-        sensor: the sensor that sends the packets.
         frame: the frame type of the packets.
         stats: the decoder's counters, to which lost, duplicate and late packets are added.
         backend: the back end that computes points: "auto", "numpy" or "jit".
@@ -185,7 +184,6 @@ class PacketStream:
         """Return the unwrapped clock times of packets, (n,) ns, and store the last one.
 
         Args:
-            batch: the packets.
             host: arrival times, (n,) ns; 0 if unknown.
             whole: whether the packets are the whole input.
         """
@@ -307,9 +305,7 @@ class ImuStream:
     """Reads the IMU samples of one stream, from all frame types that have IMU data.
 
     Args:
-        sensor: the sensor that sends the frames.
         stats: the decoder's counters.
-        backend: the back end that computes points, see `PacketStream`.
         state: frames of other types, by name, see `PacketStream`.
 
     Attributes:

@@ -83,7 +83,6 @@ class UtcChange:
 
     Attributes:
         utc_ns: the UTC at which the source begins to apply, ns since 1970.
-        source: the source.
         is_first: whether this is the first source of UTC.
     """
 
