@@ -47,8 +47,6 @@ class PacketCounts:
         """Return the counts of the first packets of a batch.
 
         Args:
-            packets: the batch.
-            number: the number of packets to count.
             points: the number of points of each packet, (number,); None to measure sizes in bytes.
             previous_index: the index of the packet before the batch; None at the start of the
                 stream.

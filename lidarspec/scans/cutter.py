@@ -64,7 +64,6 @@ class ScanCutter:
         """Cut scans in a masked sector from now on.
 
         Args:
-            sector: the masked sector.
             angle: the angle of the last packet before the sector was found, in turns; None if there
                 was no packet.
         """

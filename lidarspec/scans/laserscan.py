@@ -53,7 +53,6 @@ def find_nearest_returns(
     """Return the nearest return at each of `count` angles, and its intensity.
 
     Args:
-        points: the points.
         count: the number of angles.
         first: the first angle, radians.
         step: the step between angles, radians.

@@ -77,12 +77,11 @@ class ScanLimits:
 
         Args:
             scan: the counts of the scan before the next packets.
-            packets: the next packets.
             usual: the number of packets of a whole scan.
 
         Returns:
             The row of this packet, or None; and True for a limit of all scans, False for the limit
-                of scans with missing packets.
+            of scans with missing packets.
         """
         since = scan.since if scan.packets else packets.times.item(0)
         is_overdue = np.abs(packets.times - since) > self.longest_ns

@@ -37,8 +37,6 @@ class PointRun(NamedTuple):
     """Consecutive points of one batch of packets.
 
     Attributes:
-        packets: the batch.
-        points: the points of the batch.
         start: the index in `points` of the first point of the run.
         stop: the index in `points` after the last point of the run.
         parts_before: how many parts of the first frame were in earlier batches.

@@ -210,8 +210,7 @@ def previous_values(values: Floats, first: float | None) -> Floats:
     """Return the previous value of each value, (k,).
 
     Args:
-        values: the values, (k,).
-        first: the previous value of the first value; None to use the first value itself.
+        first: the value before the first; None to use the first value itself.
     """
     previous = np.empty_like(values)
     if first is None:

@@ -70,7 +70,6 @@ class EndFinder:
         """Cut scans in a masked sector, unless the user has configured an angle for cuts.
 
         Args:
-            sector: the masked sector.
             angle: the angle of the last packet before the sector was found, in turns; None if there
                 was no packet.
         """
@@ -160,7 +159,6 @@ class EndFinder:
         """Return the rows at which a scan begins.
 
         Args:
-            rule: the sensor's rule for the ends of scans.
             values: the values of the rows.
             full: a whole turn in the unit of the values; None if they are not angles.
         """

@@ -279,7 +279,6 @@ class ScanSelector:
     """Applies a selection to the scans of one stream.
 
     Args:
-        selection: the selection.
         source: the name of the source, for messages.
         skip: a function that skips the data before an arrival time, in ns since 1970, and returns
             whether it skipped data; None if the source cannot seek.

@@ -45,10 +45,8 @@ class ScanStream:
     """Makes scans from the packets of one stream.
 
     Args:
-        sensor: the sensor that sends the packets.
         mount: the mount of the sensor; the scans are then in the axes of its carrier.
-        imu: the IMU samples of the sensor. Add samples to it before the packets that arrived with
-            them.
+        imu: the buffer of IMU samples. For each batch, add the samples before the packets.
     """
 
     def __init__(
@@ -158,7 +156,6 @@ class ScanStream:
         """Calculate the points of sorted packets, and return the scans that they complete.
 
         Args:
-            packets: the packets.
             final: whether no packets follow.
         """
         self._waiting = None
