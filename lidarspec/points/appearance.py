@@ -85,7 +85,8 @@ def choose_appearance(
 
     Args:
         points: the cloud.
-        ramp: the column that the colours show; the range if the cloud has no intensity.
+        ramp: the column that the colours show. If the cloud has no intensity, "intensity" shows the
+            range.
         reach: the distance from the middle to the nearer edge, metres; None to fit the cloud.
 
     Raises:

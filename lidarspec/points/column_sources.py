@@ -19,7 +19,6 @@ class ColumnSource:
     """A source of the columns of consecutive points.
 
     Attributes:
-        size: the number of points.
         base: the time that the column "time" counts from, int64 ns.
         grid: the organisation of all points together.
         grids: the organisation of the points of each packet, if packets have different shapes.
@@ -67,7 +66,6 @@ class LazyColumns:
     """The columns of a source, each computed when it is first read.
 
     Attributes:
-        source: the source.
         computed: the columns computed so far, by name; None if the sensor does not have a column.
     """
 

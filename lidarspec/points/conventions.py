@@ -178,7 +178,6 @@ class Grids(NamedTuple):
     Attributes:
         ends: (n,) the index after the last point of each packet.
         which: (n,) the index in `grids` for each packet; any index for a packet without points.
-        grids: the different organisations.
     """
 
     ends: NDArray[np.intp]

@@ -169,11 +169,7 @@ class GroupPoints:
         return share
 
     def take(self, which: NDArray[np.intp]) -> GroupPoints:
-        """Return a group with some of the packets of this group.
-
-        Args:
-            which: the indices of the packets.
-        """
+        """Return a group with some of the packets of this group."""
         remembered = {
             node.number: self.plain_values.column(node)
             for node in self.plan.eager_nodes

@@ -15,8 +15,8 @@ from lidarspec.points.conventions import narrow_angle
 class Mount:
     """Position and orientation of a sensor on its carrier.
 
-    The axes of both point forward, left and up (REP-103). The sensor is rotated by roll, pitch and
-    yaw about the fixed axes of the carrier.
+    The axes of sensor and carrier point forward, left and up (REP-103). The sensor is rotated by
+    roll, pitch and yaw about the fixed axes of the carrier.
 
     Attributes:
         x, y, z: the position of the sensor's origin, metres forward, left and up.

@@ -4,9 +4,9 @@ The `points` function is traced once for each layout. `Plan` converts its result
 the columns, by the formulas of `points.conventions`. A back end compiles the plan to a
 `ColumnMaker`, which computes the columns.
 
-The columns of a `Cartesian` result are exact: they are computed in float64 in the order in which
-they are written. The columns of a `Polar` result may be computed in another order and partly in
-float32, so that the floating-point fields of a batch have to be within `MODERATE_SIZES`.
+The columns of a `Cartesian` result are computed in float64. The columns of a `Polar` result may be
+computed in float32, so that the floating-point fields of a batch have to be within
+`MODERATE_SIZES`.
 """
 
 from __future__ import annotations
@@ -78,21 +78,15 @@ class Plan:
     """A plan that computes the points of frames with one layout.
 
     Attributes:
-        function: the `points` function.
-        layout: the layout of the frames.
         tape: the traced operations of `points`.
         parts: the parts of the result of `points`, by name, as nodes or constant arrays.
         shape: the shape of the points of a packet, one length for each axis in `axes`.
         expressions: the columns that back ends compute, by name, as nodes or arrays.
-        extra: the types of the columns in `extra`, by name.
         sent: the fields with the raw integers of columns in `extra`, by the name of the column.
         exact: whether coordinates and range are computed in float64 in the written order.
         positive: nodes whose values have to be positive numbers for the plan to be valid.
-        nominal: whether a default calibration is used instead of the sensor's own.
         varying: the arrays whose lengths differ from frame to frame.
         tables: the lookup tables of back ends, shared by the plans of the function.
-        programs: the compiled programs of `numpy_plan`, by the names of their columns.
-        kernels: the compiled kernels of `numba_kernels`, by the names of their columns.
 
     Raises:
         UntraceableError: if only the reference evaluator can compute the points.
@@ -234,12 +228,7 @@ class Plan:
     def _make_polar_columns(
         self, parts: Mapping[str, Any], named: Mapping[str, AlongAxis]
     ) -> dict[str, Any]:
-        """Return the columns of a `Polar` result.
-
-        Args:
-            parts: the parts of the result.
-            named: the parts that are arrays along a named axis, by name.
-        """
+        """Return the columns of a `Polar` result."""
         distance = mark_invalid(self._mark_distance(parts["range"]), parts["invalid"])
         azimuth, elevation, *origin = (
             named.get(name, parts[name]) for name in ("azimuth", "elevation", "ox", "oy", "oz")

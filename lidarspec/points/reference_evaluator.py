@@ -32,8 +32,6 @@ class PacketBatch(Protocol):
     """The attributes of `Packets` that evaluation needs.
 
     Attributes:
-        sensor: the sensor.
-        frame: the name of the frame type.
         table: the raw columns of the frames.
         time_ns: the times of the packets, (n,) int64 ns.
         stats: the counters of the decoder.

@@ -48,7 +48,6 @@ def compile_kernel(stored, signature, **options):
     Args:
         stored: an object that loads and saves the compiled code.
         signature: the types of the arguments.
-        options: further options of Numba.
     """
 
     def make(function):

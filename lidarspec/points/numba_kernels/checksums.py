@@ -3,9 +3,6 @@
 A checksum that is linear with respect to XOR, such as a CRC, is the checksum of a frame of zeros,
 XORed with one value for each byte. This value, the share of the byte, is looked up in a table of
 256 values for each offset.
-
-CRCs of many bytes, and CRCs of more than 16 bits, are computed eight bytes at a time ("slicing by
-eight").
 """
 
 from __future__ import annotations
@@ -118,6 +115,8 @@ def _compute_along_rows(
     Args:
         spans: the covered bytes, as pairs of the first offset and the offset after the last.
     """
+    # Eight bytes are processed at a time ("slicing by eight"), in four rows side by side, because
+    # each step of a row depends on its previous step.
     table, _, _ = make_place_tables(8, 0, algorithm.width, algorithm.poly, algorithm.refin)
     found = np.empty(len(rows), np.int64)
     edges = np.array(spans, np.int64).reshape(-1)
@@ -132,18 +131,6 @@ class _ByteShares:
     """Tables from which the checksum of a frame is computed byte by byte.
 
     The share of a byte is the change of the checksum that this byte causes.
-
-    Attributes:
-        seen: the number of frames so far.
-        is_suited: whether the checksum can be computed from shares.
-        start: the checksum of a frame of zeros.
-        words: the offsets at which words of eight bytes are loaded.
-        tables: the share of each byte of these words, by its value; 0 for bytes that do not count.
-        is_plain: whether each share is the byte itself, in the low or the high byte of the
-            checksum.
-        lows: if `is_plain`, for each word, a mask of the bytes with a share in the low byte of the
-            checksum.
-        highs: the same for the high byte of the checksum.
     """
 
     def __init__(self, seal: Seal) -> None:
@@ -160,6 +147,10 @@ class _ByteShares:
 
     def make(self, size: int) -> None:
         """Compute the tables, for frames of `size` bytes."""
+        # `words` are the offsets of words of eight bytes, and `tables` the shares of their bytes by
+        # value: 0 for bytes that are not covered, or that an earlier word contains. `is_plain` is
+        # set if each share is the byte itself, in the low or the high byte of the checksum; `lows`
+        # and `highs` are masks of these bytes, one for each word.
         places = self._places.tolist()
         rows = np.zeros((len(places), 256, len(places)), np.uint8)
         rows[np.arange(len(places)), :, np.arange(len(places))] = np.arange(256)

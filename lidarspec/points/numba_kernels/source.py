@@ -1,8 +1,8 @@
 """Write the source of a kernel that computes points from the bytes of frames.
 
 A kernel is a nested loop over packets, blocks and points. Each value is computed in the outermost
-loop in which it is constant. If a kernel cannot compute an expression, NumPy computes it before the
-kernel is called, and passes it as an argument.
+loop in which it is constant. If a kernel cannot compute an expression, NumPy computes the values
+before the kernel is called.
 
 Sines and cosines that differ from point to point are computed in a second, flat loop, so that the
 compiler can vectorize it.
@@ -104,7 +104,6 @@ class DeferredFloat:
 
     Attributes:
         sign: the operator, "*", "+" or "-".
-        parts: the operands.
     """
 
     sign: str
@@ -116,7 +115,6 @@ class Trig:
     """The cosine or sine of an angle, computed in the flat loop over points.
 
     Attributes:
-        name: "cos" or "sin".
         angle: the index of the angle in `KernelWriter.angles`.
     """
 

@@ -77,7 +77,6 @@ def write_integer(leaf: Leaf, byte: Any) -> str | None:
     """Return the raw value of a field as an expression of its bytes, or None.
 
     Args:
-        leaf: the field.
         byte: a function that returns the expression of the byte at an offset.
     """
     if len(leaf.shape) > len(leaf.strides) or (leaf.wire is not None and leaf.wire.kind == "f"):
@@ -220,7 +219,7 @@ def find_run(leaf: Leaf) -> tuple[str, int, int, int] | None:
 
     Returns:
         The byte order, the first byte, the number of bytes and the lowest bit; None for other
-            fields.
+        fields.
     """
     if len(leaf.shape) > len(leaf.strides):
         return None
@@ -270,7 +269,6 @@ class KernelWriter:
     """Writes the source lines of a kernel that compute values.
 
     Args:
-        layout: the layout of the frames.
         shape: the shape of the points of a packet.
         tables: the lookup tables by a key that describes their contents; new tables are added.
         varying: the arrays whose lengths differ from frame to frame.
@@ -457,7 +455,6 @@ class KernelWriter:
         """Return the text of a lookup that replaces an expression of one field, or None.
 
         Args:
-            node: the expression.
             source: the field.
             kind: the dtype of the table.
             factor: a number by which the values are multiplied.

@@ -43,8 +43,6 @@ class ProgramRun:
         rows: the frames, (n, size).
         values: a function that returns the value of a node for the batch, (n or 1, ...).
         views: the array of each register for the current chunk.
-        start: the first packet of the current chunk.
-        stop: the packet after the current chunk.
     """
 
     rows: Bytes2D
@@ -97,7 +95,6 @@ class Program(ColumnMaker):
 
     Attributes:
         chunk: the number of packets of a chunk.
-        steps: the steps, in order.
         kinds: the kind of each register.
         outputs: the register of each column.
     """
