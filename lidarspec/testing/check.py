@@ -1,8 +1,7 @@
 """Check a sensor, a file or a distribution with every property and every rule.
 
-`find_target` resolves a name to a `CheckTarget`. `iter_reports` checks the sensors of the target.
-`check_texts` finds mistakes in the source of a plugin that are valid Python but have an unintended
-effect. `SourceTexts` adds file and line to findings.
+`find_target` finds the sensors to check, and `iter_reports` checks them. `check_texts` finds
+mistakes in the source of a plugin that are valid Python.
 """
 
 from __future__ import annotations
@@ -571,7 +570,6 @@ class Report:
     Attributes:
         name: the sensor's id, or the checked name if the report is about loading errors.
         findings: the findings.
-        held: number of properties that hold.
         skipped: property -> the reason why it does not apply.
         measured: measured values of frames, by description.
         picture: measured values of points, by description; the author compares them with the

@@ -29,8 +29,8 @@ def make_arguments(subject: SensorUnderTest, name: str, share: float) -> dict[st
     """Return a valid value for each argument of a command, by name.
 
     Args:
-        share: position of a number between its limits, from 0 to 1; for a text, its length relative
-            to the maximum length.
+        share: from 0 for the lowest number and the shortest text, to 1 for the highest number and
+            the longest text.
     """
     return {
         key: _make_argument(subject.sensor, name, key, share)

@@ -232,8 +232,7 @@ def list_unacknowledged(findings: list[Finding], sensor: Sensor, *, whole: bool)
     """Return the findings that a declaration does not acknowledge with a reason.
 
     Args:
-        whole: whether all rules were checked, so that each acknowledgement without a finding can be
-            reported.
+        whole: whether all rules were checked; if so, unused acknowledgements are reported.
     """
     given = {
         "": sensor.acknowledged,

@@ -1,7 +1,7 @@
 """Checks of single frames: valid examples, edited frames and damaged frames.
 
 construct may omit bits, truncate numbers and accept contradictory values without an error. To find
-such faults, a frame is parsed and built again, with and without edits.
+such faults, a frame is parsed and built again.
 """
 
 from __future__ import annotations

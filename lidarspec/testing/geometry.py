@@ -1,8 +1,7 @@
 """Checks of a sensor's points that are possible without its manual.
 
 Four kinds of frames are used: random examples, packets of the sensor's `sweep`, frames with a
-changed angle, and packets that are simulated in a room. `distance_outside` computes the distance of
-points from the walls of the room without the code of the simulator.
+changed angle, and packets that are simulated in a room.
 
 The measured values are reported (`SensorUnderTest.picture`), so that the author can compare them
 with the manual.

@@ -65,8 +65,8 @@ class Property:
         lacks: a function that returns the reason why the property does not apply to a sensor, or ""
             if it applies.
         unless: codes of other rules; if one of them is violated, the property is not tested.
-        depends_on: attributes of a sensor that determine the result. If a tested related model has
-            equal attributes, the property is not tested again.
+        depends_on: attributes of a sensor that determine the result; related models with equal
+            attributes are not tested again. If empty, each sensor is tested.
     """
 
     function: Callable[..., None]

@@ -164,15 +164,12 @@ class SensorUnderTest:
     """A sensor under test.
 
     Attributes:
-        sensor: the sensor.
         examples: number of examples of each frame type for each property.
         strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of
             `random.Random`.
         vectors: the file of golden vectors; None if there is no such file.
-        family: the ids of the sensors that share that file; empty if the file belongs to this
-            sensor alone.
-        tested: related models that are tested as well. Frame types that this sensor shares with
-            them are not tested again.
+        family: the ids of the sensors that share the file of golden vectors.
+        tested: related models; frame types that they share with this sensor are not tested again.
         measured: measured values of frames as text, by description.
         picture: measured values of points as text, by description, to compare with the manual.
         traced: data frame -> the result of `geometry.trace_points`.
@@ -225,7 +222,6 @@ class SensorUnderTest:
         """Return the seeds of the examples with which a property tests a frame type.
 
         Args:
-            name: the frame type.
             share: the number of examples relative to the usual number.
         """
         few = 8 if self.sensor.frames[name].max_length > MAX_SHORT_BYTES else 1

@@ -1,8 +1,7 @@
 """The ranges of values that are valid in one layout, for drawing field by field.
 
-One valid frame, the base, is searched first. The range of a field contains values that are valid if
-all other fields keep their values of the base. `LayoutRanges.repair` replaces drawn values that are
-not valid together.
+The range of a field contains values that are valid in one example frame, the base. Values of
+several fields may be invalid together; `LayoutRanges.repair` replaces these values.
 """
 
 from __future__ import annotations
@@ -46,7 +45,6 @@ class LayoutRanges:
         base: a valid struct of the layout, (size,).
 
     Attributes:
-        layout: the layout.
         free: the fields to draw: all fields except header fields, constants, lengths and checksums.
     """
 

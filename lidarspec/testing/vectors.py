@@ -447,8 +447,7 @@ def _belongs_to(subject: SensorUnderTest, vector: Mapping[str, Any], entry_key: 
     """Return whether an entry belongs to the sensor.
 
     Raises:
-        ViolationError: if the entry names an unknown sensor, or if the entry has to name a sensor
-            but does not.
+        ViolationError: if the entry names an unknown sensor, or lacks the name of its sensor.
     """
     named = vector.get("sensor", [])
     family = subject.family
