@@ -169,7 +169,6 @@ class _AnswerLog:
 
         Args:
             number: number of chunks that were received before the reply.
-            seconds: maximum waiting time.
         """
         end = time.monotonic() + seconds
         count = number

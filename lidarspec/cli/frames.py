@@ -193,7 +193,7 @@ def listing(
 
     Args:
         at: the offset of a byte; the title names the field at this offset.
-        every: whether to draw the bits of all elements of an array, or of the first element.
+        every: whether to draw the bits of all elements of an array, instead of the first element.
         verdicts: whether to add the damage of each piece to its title.
     """
     for index, (piece, part) in enumerate(parts):
@@ -438,7 +438,6 @@ def _find_sensor(
     """Return the named sensor, or the first of the sensors that fit some bytes.
 
     Args:
-        sample: the bytes.
         sensor_id: the named sensor; None to find a sensor.
         damaged: whether to return the most similar sensor if the bytes contain no valid frame.
 

@@ -1,7 +1,7 @@
 """Read the input of verbs, and explain why it contains no frame.
 
-The input is hexadecimal text, a file, standard input or a configured device. Some modules are
-imported inside functions, so that verbs start faster that do not need these modules.
+The input is hexadecimal text, a file, standard input or a configured device. Slow modules are
+imported inside functions, so that verbs start quickly.
 """
 
 from __future__ import annotations

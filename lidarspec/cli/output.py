@@ -111,7 +111,6 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         Args:
             remarks: an iterator that runs the task. It yields texts to print; an empty text only
                 updates the progress.
-            text: returns the progress text.
         """
         for remark in remarks:
             self(text)
@@ -233,9 +232,7 @@ def emit_json_list(
     """Write a JSON object with a list, whose items are written as the iterator yields them.
 
     Args:
-        head: the entries before the list.
         name: the key of the list.
-        items: the items of the list.
         output: the file; None for standard output.
     """
     beginning = json.dumps({**head, name: []}, indent=2, allow_nan=False).removesuffix("]\n}")

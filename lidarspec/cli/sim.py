@@ -220,7 +220,7 @@ def _serve(
         as_json: whether the address is printed as JSON.
 
     Raises:
-        UsageError: if the port is invalid, or there is a link to a port that is no pty.
+        UsageError: if the port is invalid, or if `link` is given for a port that is no pty.
     """
     sensor = device.sensor
     try:
@@ -337,7 +337,7 @@ def _find_default_sensor() -> Sensor:
     """Return the first installed sensor that declares a `sweep` for its data frames.
 
     Raises:
-        UsageError: if there is none.
+        UsageError: if no such sensor is installed.
     """
     for sensor in registry().sensors().values():
         if any(sensor.simulation_of(name).sweep for name in sensor.data_frames):
@@ -355,11 +355,7 @@ def _draw_picture(scan: Scan) -> Text:
 
 
 def _summarize(result: Demonstration, whole: list[Scan]) -> list[str]:
-    """Return the lines of the summary.
-
-    Args:
-        whole: the complete scans.
-    """
+    """Return the lines of the summary."""
     stats = result.stats
     name = result.sensor.id
     frames = sum(stats.frames.values())

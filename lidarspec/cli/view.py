@@ -270,7 +270,7 @@ def _draw_once(
 
     Raises:
         CommandError: if the sensor sends nothing.
-        WireError: if its data contains no scan.
+        WireError: if the data contains no scan.
     """
     feed = LiveScans(device, select=selection)
     end = time.monotonic() + patience
