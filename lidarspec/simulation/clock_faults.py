@@ -154,7 +154,6 @@ class ClockTimeline:
     """The readings of a faulty clock since power-on.
 
     Args:
-        faults: the faults.
         power_on_ns: the time of the computer when the sensor was switched on, ns since 1970 in UTC.
 
     Attributes:

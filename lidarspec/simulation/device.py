@@ -61,11 +61,7 @@ REQUEST_TIMEOUT_NS = 50_000_000
 
 @dataclass(frozen=True, eq=False)
 class ReceivedCommand:
-    """A received command, with the raw values in its frame by field path.
-
-    A text that matches a placeholder of the command is a value as well; the key is the placeholder,
-    for example "{handle}".
-    """
+    """A received command, with raw values by field path or "{placeholder}"."""
 
     name: str
     command: Command

@@ -71,7 +71,6 @@ class FrameMaker:
 
         Args:
             sensor: id of the sensor, for messages.
-            root: the node of the parts.
             limit: maximum length of a frame, in bytes.
             given: raw values of the fields of the frame on which the parts depend.
         """

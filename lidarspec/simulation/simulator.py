@@ -3,9 +3,10 @@
 Packets are made in four steps:
 
 1. The sensor's `sweep` gives the values that are not measured, such as angles, counters and time.
-2. The sensor's `points` gives the directions of the beams. 3. The scene gives the range of each
-beam. 4. `Measurement` writes the ranges into the range fields. `PointPlacement` writes the
-coordinates of Cartesian points.
+2. The sensor's `points` gives the directions of the beams.
+3. The scene gives the range of each beam.
+4. `Measurement` writes the ranges into the range fields. `PointPlacement` writes the coordinates of
+   Cartesian points.
 
 To find the points that depend on a field, each field in metres is set to a probe value. If the
 sensor declares a function `encode`, this function returns the values of the fields instead.
@@ -595,7 +596,6 @@ class RestingImu:
 
         Args:
             shake: standard deviation of the noise, m/s2 and rad/s; 0 for no noise.
-            seed: seed of the noise.
         """
         table = PartRows(frames, self._path) if self._path else frames
         if not len(table):
@@ -681,10 +681,6 @@ class RestingImu:
 class PacketTimes:
     """Calculates the times of a sensor's packets, one batch after another.
 
-    Args:
-        table: the first packets.
-        beams: the beams of these packets.
-
     Attributes:
         interval: mean time between packets, ns; 0 if the spec does not determine times.
     """
@@ -703,7 +699,6 @@ class PacketTimes:
         """Return the times of the packets of a batch, since the first packet, (n,) ns.
 
         Args:
-            table: the packets.
             beams: returns the beams of the packets; called only if they are needed.
         """
         if self._rate:
@@ -753,7 +748,6 @@ class PacketBlock:
     """n consecutive packets.
 
     Attributes:
-        frames: the bytes of each packet.
         times: time of each packet, and of the packet after the block, since the first packet, (n +
             1,) int64 ns.
     """
@@ -831,7 +825,6 @@ class FrameSimulation:
         """Return `count` packets of the sweep, beginning with number `start`.
 
         Args:
-            scene: the scene to measure.
             since: time of the first packet, seconds since the scene began.
             shake: standard deviation of the noise on IMU measurements, m/s2 and rad/s.
             timeline: the faults of the sensor's clock; None for no faults.
@@ -958,7 +951,6 @@ class FramesWithoutPoints:
         """Return frames with the values that the spec declares.
 
         Args:
-            numbers: the numbers of the frames.
             values: physical values that replace declared values.
         """
         declared = self._sensor.frames[name]
@@ -1010,7 +1002,6 @@ def simulate(
     For a sensor without points, returns the frames that it sends periodically.
 
     Args:
-        sensor: the sensor.
         packets: number of frames.
         start: number of the first frame; frame 0 is sent when the sensor is switched on.
         scene: the scene to measure, for example from `read_scene`; by default a room.
