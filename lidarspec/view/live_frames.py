@@ -40,8 +40,6 @@ class LiveFrames:
     Attributes:
         packets: the packets that were read last, one batch for each frame type.
         ended: whether the input has ended.
-        meter: counts the frames.
-        clock: watches the sensor's clock.
     """
 
     def __init__(self, device: Device) -> None:

@@ -53,8 +53,6 @@ class LiveScans:
         scans: the complete and incomplete scans of the last `read` or `step`.
         scan: the newest complete scan; before the first complete scan, an incomplete scan or None.
         number: number of times that `scan` has changed.
-        meter: counts packets and scans.
-        clock: watches the sensor's clock.
 
     Raises:
         UsageError: for a sensor without points.

@@ -177,7 +177,6 @@ def draw_ranges(scans: Iterable[Scan], title: str) -> Any:
 
     Args:
         scans: at least one scan.
-        title: the title of the figure.
     """
     kept = list[tuple[int, NDArray[np.float32], bool]]()
     step = 1

@@ -75,8 +75,6 @@ def open_page_server(
     Args:
         source: the source, as the user typed it.
         sensor: the sensor, or its id; None to detect it.
-        selection: the scans to show.
-        host: the address to listen on.
         port: the port to listen on; 0 for any free port.
         control: whether pages may send commands.
         report: called with each message for the user.

@@ -54,9 +54,7 @@ def svg(
     """Return a cloud as an SVG document, from above and from its right side.
 
     Args:
-        points: the cloud.
         look: the appearance; a flat cloud is drawn only from above.
-        title: the title of the picture.
         side: side of the view from above, in pixels.
         most: maximum number of dots in a view; None for no limit.
     """
@@ -100,10 +98,8 @@ class _View:
     """One view of a cloud.
 
     Attributes:
-        parts: the SVG elements.
         top: the upper end of the view, in pixels.
         height: the height of the view, in pixels.
-        dots: number of dots.
     """
 
     title: str
@@ -118,7 +114,6 @@ class _ViewDrawer:
     """Draws the views of a cloud.
 
     Attributes:
-        cloud: the valid points.
         side: side of the view from above, in pixels.
         most: maximum number of dots in a view; None for no limit.
         colours: the colour of each point, as a step of the colour ramp, (n,).
@@ -262,9 +257,6 @@ class _Labels:
     Args:
         side: width of the view, in pixels.
         top, bottom: vertical limits of the view, in pixels.
-
-    Attributes:
-        parts: the texts as SVG elements.
     """
 
     def __init__(self, side: float, top: float, bottom: float) -> None:

@@ -1,6 +1,6 @@
 """Show pictures on the alternate screen of a terminal, and read single keys.
 
-Only changed cells are written. The library rich would write all cells of each picture.
+Only changed cells are written. The library rich, which writes all cells, is not used.
 """
 
 from __future__ import annotations
@@ -286,7 +286,6 @@ def encode_changes(before: CellGrid | None, after: CellGrid, depth: Depth) -> st
 
     Args:
         before: the shown picture; None for an empty screen.
-        after: the new picture.
         depth: the colour depth of the terminal.
     """
     if before is not None:

@@ -57,7 +57,6 @@ class ViewSettings:
         ramp: the column that the colours show.
         zoom: magnification; 1.0 shows all points.
         middle: the middle of the picture, in metres forward and left of the sensor.
-        paused: whether the picture is paused.
         shows_keys: whether the list of keys is shown.
         is_closing: whether the window is to be closed.
     """
@@ -75,7 +74,6 @@ class ViewSettings:
         """Return the settings after a key press.
 
         Args:
-            key: the name of the key.
             reach: distance from the middle of the picture to its edge, in metres.
             ramps: the columns that the colours can show.
         """

@@ -66,7 +66,6 @@ def write_side(
     Args:
         left: the first column to the right of the picture.
         figures: the statistics, one per line.
-        look: the appearance of the picture.
     """
     columns, lines = window.size
     for row in range(1, lines):
