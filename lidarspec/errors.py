@@ -385,9 +385,9 @@ class UnknownSensor(UnknownName):
     """No installed sensor has this id or alias.
 
     Attributes:
-        distribution: the distribution that has the sensor, if the distribution is known but not
-            available; otherwise "".
-        failure: the reason why the installed distribution failed to load; otherwise "".
+        distribution: the distribution that has the sensor, but is not installed or failed to load;
+            "" if unknown.
+        failure: the reason why the distribution failed to load; "" if it is not installed.
     """
 
     what = "sensor"

@@ -129,7 +129,7 @@ def list_described_sensors() -> list[KnownSensor] | None:
 
 
 def find_known_sensor(name: str) -> KnownSensor | None:
-    """Return the row of a sensor in the table of known sensors; None without a row.
+    """Return the row of a sensor in the table of known sensors, or None.
 
     Args:
         name: an id or alias, in upper or lower case, with or without hyphens.

@@ -1,9 +1,8 @@
 """Leap seconds: the offsets of TAI and GPS time from UTC.
 
-TAI and GPS time count all seconds. At each leap second, UTC falls behind by one more second. GPS
-time is always 19 s behind TAI. The dates of the leap seconds are read from the newest table of the
-operating system or of the package tzdata. Without a table, the offset since 2017 is used for all
-times.
+The dates of the leap seconds are read from the newest table of the operating system or of the
+package tzdata. Without a table, the offset since 2017 is used for all times. GPS time is always
+19 s behind TAI.
 
 Source: IERS Bulletin C; tz database, `leapseconds`; NIST, `leap-seconds.list`.
 """

@@ -182,7 +182,6 @@ class Plugin:
 
     Attributes:
         distribution: the name of the distribution that contains the plugin.
-        version: the version of this distribution.
         entry_point: the entry point that declares the plugin.
         sensors: the ids that the plugin adds.
         error: the reason why the plugin or one of its ids is not available; "" if there is no
@@ -190,7 +189,6 @@ class Plugin:
         rule: the code of the rule of `lidarspec check` that explains the error; "" if there is
             none.
         failed_sensor: the id that the error concerns; "" if the error concerns the whole plugin.
-        traceback: the traceback of the error.
         remark: a description of side effects of loading the plugin, such as printed text.
     """
 
@@ -384,11 +382,7 @@ class Registry:
         return None
 
     def _find_same_names(self, home: Home, name: str) -> set[str]:
-        """Return all names under which a plugin registers a sensor.
-
-        Args:
-            name: one of the names.
-        """
+        """Return all names under which a plugin registers a sensor."""
         entries = self._offered.get(home, [])
         values = {entry.value for entry in entries if entry.name == name}
         loaded = [{sensor.id, *sensor.aliases} for sensor in self._sensors.get(home, {}).values()]
