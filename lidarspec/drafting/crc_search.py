@@ -5,7 +5,7 @@ same length is divisible by the polynomial of their CRC. The polynomial is there
 the greatest common divisor of such XORs.
 
 The start value and the final XOR are calculated from the polynomial. If all frames have the same
-length, many pairs of values are equivalent, and the most usual pair is returned.
+length, many pairs of start value and final XOR are equivalent, and the most usual pair is returned.
 
 If there are too few frames of the same length, the search assumes that the start value and the
 final XOR are 0 or all ones.
