@@ -12,9 +12,8 @@ a packet of the IMU.
 The sources disagree about the axes. In the manual's formula, x is proportional to the sine of the
 azimuth. In rs_driver, x is proportional to the cosine and y to the negative sine, as for all
 models. This module follows rs_driver. It is assumed that the integers of the IMU are big-endian,
-like all other integers. It is also assumed that blocks with dual return have the order that
-rs_driver derives from their position. Packets of models with 48 or 192 lasers (`lidar_model` 1 or
-3) are not accepted.
+like all other integers. With dual return, the order of the blocks is assumed to be the order in
+rs_driver. Packets of models with 48 or 192 lasers (`lidar_model` 1 or 3) are not accepted.
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ Source: the vendor's rs_driver (decoder.hpp, decoder_mech.hpp, block_iterator.hp
 geometry, time, gaps); RS-Helios-16P user manual, Table 11 and appendix B (fields of the second
 layout); Airy manual, Table 8 (one DIFOP packet a second, assumed for the other models).
 
-If a field of view is configured, there is a gap between two blocks of a packet. The points after
-the gap were measured later than their times, which are not corrected.
+If a field of view is configured, there is a gap between two blocks of a packet. The times of the
+points after the gap are too early, and are not corrected.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ sllidar_ros2, ranges from the models' data sheets if `source` names them.
 A response descriptor announces the kind of the following data frames, and a kind is searched for
 only after its descriptor. The kinds are `node`, `express`, `ultra`, `dense`, `ultra_dense` and
 `hq`. By default, the first kind in an input is decoded. ``configure(answer="express")`` selects
-another kind, and starts as if its descriptor had been received, which is needed for recordings that
-begin after the descriptor.
+another kind, and does not wait for its descriptor. Recordings that begin after the descriptor
+require this option.
 
 For all kinds, a scan ends when the azimuth of the points passes zero.
 

@@ -15,9 +15,8 @@ The table shows the number of false nodes, i.e. accepted nodes that were not sen
     nodes with 1 % of the bytes damaged, 2 MiB     7 430    1 811   1 760   1 732
 
 Nodes are searched for only after the descriptor 81. Capsules are therefore searched for nodes only
-if a later descriptor was lost. The false nodes in the last row continue an accepted run at a
-shifted offset, which no run length prevents. Of 419,430 nodes that were sent, 411,423 are found
-with runs of 1, and 395,728 with runs of 10. A test repeats this with less data.
+if a later descriptor was lost. Of 419,430 nodes that were sent, 411,423 are found with runs of 1,
+and 395,728 with runs of 10. A test repeats this with less data.
 
 Source: RPLIDAR interface protocol, "SCAN"; HQ capsules: the vendor's SDK (sl_lidar_cmd.h,
 handler_hqnode.cpp).

@@ -5,9 +5,9 @@ interpolated to the azimuth of the next block, in proportion to their times. Wit
 consecutive blocks contain the two returns of the same firings and have the same azimuth, so the
 next azimuth is two blocks ahead.
 
-If a packet was lost, the azimuth of the next block is further ahead than the sensor can have
-rotated. The same is true after a sector that is masked in the sensor's settings. In these cases,
-and if there is no next block, the user's choice applies:
+The next azimuth cannot be used if a packet was lost, if a sector is masked in the sensor's
+settings, or if there is no next block. In these cases, the option `last_block` selects the
+azimuths:
 
 * "previous", the default: the last valid step is used again, as ros-drivers and nebula do for the
   last block of every packet.
