@@ -12,7 +12,7 @@ from lidarspec.spec.timing import DAY_S
 class FindingType(NamedTuple):
     """The text and the advice for one kind of finding.
 
-    Names in braces are replaced by attributes of `ClockFinding`.
+    Names in braces in the text are replaced by attributes of `ClockFinding`.
 
     Attributes:
         text: what was found.

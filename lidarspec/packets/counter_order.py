@@ -142,8 +142,7 @@ class CounterOrder:
         The index has gaps for lost packets.
 
         Args:
-            batch: the packets. `batch.breaks` marks skipped bytes; the returned breaks contain
-                these marks.
+            batch: the packets. The breaks in `batch.breaks` are returned as well.
             times: times by the sensor's clock, (n,) ns; None without a clock.
 
         Raises:
