@@ -49,7 +49,7 @@ class FieldWindow:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """The dtype of the window."""
+        """The dtype of the bytes, read as an integer."""
         return np.dtype(f"<u{self.size}")
 
 

@@ -625,7 +625,7 @@ def _write_function(
     turns: list[str],
     columns: Mapping[str, np.dtype[Any]],
 ) -> str:
-    """Return the source of the function with its signature and its loops."""
+    """Return the source of the kernel's function, with its signature and its loops."""
     width = writer.format_number(writer.width)
     if turns:
         held = writer.format_number(max(SCRATCH_POINTS // writer.width, 1))
