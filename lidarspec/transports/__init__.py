@@ -1,7 +1,7 @@
 """Inputs and outputs: ports, sockets, files and simulated sensors.
 
-The input is a SOURCE as text. The result is an open `Transport`, which yields `Chunk`s and sends
-bytes. Modules in reading order:
+`open_transport` takes a SOURCE as text, and returns an open `Transport`, which yields `Chunk`s and
+sends bytes. Modules in reading order:
 
 * `protocol`: the base classes of transports; plugins derive from them.
 * `open_url`: opens the transport of a SOURCE.

@@ -31,10 +31,10 @@ class SourceAddress:
     """The parts of a live SOURCE.
 
     Attributes:
-        text: the whole text.
+        text: the whole SOURCE.
         scheme: "serial", "udp", "tcp" and so on.
         location: a path, or host and port.
-        options: the options after the question mark, by name. A repeated option has its last value.
+        options: name -> value of the options after the question mark.
     """
 
     text: str
@@ -68,8 +68,7 @@ class SourceAddress:
         """Check the names of the options.
 
         Args:
-            accepted: the options that this source accepts, in addition to the options of every live
-                SOURCE.
+            accepted: the options that this source accepts, besides the general options.
 
         Raises:
             UnknownOption: for the first unknown option.
@@ -142,11 +141,11 @@ def parse_origin(text: str) -> Origin:
 def resolve_host(host: str, place: str) -> str:
     """Return the numeric address of a host.
 
-    If the host has IPv4 and IPv6 addresses, returns an IPv4 address.
+    An IPv4 address is preferred to an IPv6 address.
 
     Args:
         host: an address or a name.
-        place: the option or SOURCE that contains the host, for the error message.
+        place: the option or SOURCE with the host, for the error message.
 
     Raises:
         UsageError: for an unknown host.

@@ -27,7 +27,7 @@ _Selector = getattr(selectors, "PollSelector", selectors.SelectSelector)
 
 
 class StreamTransport(LiveTransport):
-    """Base class for byte streams, which pauses for a short time after each read.
+    """Base class for byte streams, which are read with short pauses.
 
     Attributes:
         disconnect_errors: the exceptions that reading raises if the device is disconnected.

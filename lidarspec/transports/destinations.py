@@ -18,13 +18,11 @@ def make_simulated_outlet(
 ) -> Outlet:
     """Return the outlet of a simulated sensor.
 
-    The outlet has a line for the data link, and a line for each other link over which the sensor
-    receives commands.
+    The outlet has a line for each link over which the sensor sends data or receives commands.
 
     Args:
-        sensor: the sensor.
         destination: "pty", "udp://HOST:PORT" or "tcp://HOST:PORT". TCP port 0 selects any free
-            port. If the UDP port is omitted, data frames are sent to the first port that the sensor
+            port. Without a UDP port, data frames are sent to the first port that the sensor
             declares, and all other frames to the second.
         link: path of a symbolic link to the pseudo-terminal; None for no link.
 
@@ -41,8 +39,7 @@ def make_replay_outlet(destination: str, *, datagrams: bool, port: int = 0) -> O
 
     Args:
         destination: "pty", "udp://HOST:PORT" or "tcp://HOST:PORT". TCP port 0 selects any free
-            port. If the UDP port is omitted, each datagram is sent to the port to which it was sent
-            when it was recorded.
+            port. Without a UDP port, each datagram is sent to the recorded port.
         datagrams: whether the recording contains datagrams.
         port: the port for datagrams that were recorded without a port.
 
@@ -140,9 +137,9 @@ def _make_control_lines(sensor: Sensor) -> dict[str, OutletLine]:
 
 
 def _make_control_line(link: Link) -> OutletLine | None:
-    """Return a line at the declared port, or at a free port if that port is in use.
+    """Return a line at the declared port or, if it is in use, at a free port.
 
-    Returns None for a link type that only a plugin supports.
+    Returns None for a link type of a plugin.
     """
     for port in (_find_declared_port(link), 0):
         with contextlib.suppress(OSError, SourceError):
@@ -171,8 +168,7 @@ def _find_declared_port(link: Link) -> int:
 def _parse_host_and_port(destination: str) -> tuple[str, int | None]:
     """Return host and port of a destination.
 
-    The default host is this computer. The port is None if it is omitted. TCP port 0 selects any
-    free port.
+    The default host is this computer. The port is None if it is omitted.
     """
     address = SourceAddress.parse(destination)
     address.check(())

@@ -1,9 +1,8 @@
 """Transports for files and standard input.
 
-`open_file` detects the format of a file by its content: a recording, a capture, a robotics log (see
-`robotics_logs`), hexadecimal text or raw bytes. A file is read as fast as the caller requests
-chunks. The chunks of recordings and captures have the recorded arrival times; raw bytes have no
-times. Data that cannot be read is counted.
+`open_file` detects the format of a file by its content: a recording, a capture, a robotics log,
+hexadecimal text or raw bytes. A file is read as fast as the caller requests chunks. Chunks have the
+recorded arrival times; raw bytes have no times.
 """
 
 from __future__ import annotations
@@ -51,17 +50,12 @@ TEXT_SUFFIXES = {".log", ".csv", ".asc"}
 class RecordingTransport(Transport):
     """Reads the received data of a recording.
 
-    Sent data and events are skipped. After an event in `INTERRUPTIONS`, the next chunk has `gap`
-    set.
+    Sent data is skipped. The first chunk after an interruption has `gap` set.
 
     Args:
-        path: the file.
         file: the open file; None to open `path`.
         sender: yield only datagrams from this "ADDRESS" or "ADDRESS:PORT"; None for all senders.
         salvage: whether to continue after damaged parts.
-
-    Attributes:
-        header: the header of the recording.
     """
 
     def __init__(
@@ -89,9 +83,7 @@ class RecordingTransport(Transport):
         """Return the sensor of the recording, configured with the recorded options.
 
         Raises:
-            UsageError: if the recording names no sensor, or if an option cannot be restored and the
-                caller must pass it.
-            UnknownSensor: if the sensor is not installed.
+            UsageError: if the recording names no sensor, or if an option cannot be restored.
         """
         try:
             return self.header.known_sensor(Path(self._recording.path).parent)
@@ -149,10 +141,7 @@ class RecordingTransport(Transport):
         return False
 
     def _is_interruption(self, record: Record) -> bool:
-        """Return whether an event interrupts the stream.
-
-        Also counts disconnections and invalid events, and adds a warning if the clock was set.
-        """
+        """Count an event, and return whether it interrupts the stream."""
         try:
             event = json.loads(record.data)
             name = event["event"]
@@ -188,10 +177,7 @@ def _describe_skipped(path: str, count: int, size: int) -> str:
 
 
 def _check_end(transport: FileTransport | RecordingTransport, file: BinaryIO) -> bool:
-    """Return whether a compressed file was decompressed to its end.
-
-    Otherwise, a warning and the number of unread bytes are stored in the transport.
-    """
+    """Return whether a compressed file was decompressed to its end; warn if not."""
     fault = find_damage(file)
     if fault is not None:
         transport.warnings.append(fault.text)
@@ -200,11 +186,7 @@ def _check_end(transport: FileTransport | RecordingTransport, file: BinaryIO) ->
 
 
 class FileTransport(Transport):
-    """Reads the raw bytes of a file or of standard input.
-
-    Attributes:
-        file: the open file.
-    """
+    """Reads the raw bytes of a file or of standard input."""
 
     def __init__(self, path: str, file: BinaryIO) -> None:
         self._path = path
@@ -213,10 +195,7 @@ class FileTransport(Transport):
 
     @property
     def can_resume(self) -> bool:
-        """Whether another transport can continue reading at the current offset.
-
-        This requires a seekable file that is a capture or contains raw bytes.
-        """
+        """Whether another transport can continue reading at the current offset."""
         return (
             type(self) in (FileTransport, CaptureTransport, StreamCaptureTransport)
             and self.file.seekable()
@@ -280,10 +259,7 @@ def _list_counts(counts: Counter[str]) -> str:
 
 
 class HexTransport(FileTransport):
-    """Reads hexadecimal text, which may also contain times.
-
-    Lines without hexadecimal digits are skipped.
-    """
+    """Reads hexadecimal text, which may also contain times."""
 
     def chunks(self) -> Iterator[Chunk]:
         yield from hex_chunks(self._path, self.file.readline)
@@ -294,7 +270,7 @@ class CaptureTransport(FileTransport):
     """Reads the UDP datagrams of a pcap or pcapng file.
 
     Attributes:
-        reader: the reader of the file; None until `chunks` or `batches` is called.
+        reader: the reader of the file; None before `chunks` or `batches` is called.
     """
 
     datagrams = True

@@ -1,13 +1,11 @@
 r"""Read bytes from hexadecimal text and the output of common tools.
 
 The supported forms are "54 2c", "542c", "54:2c", "0x54, 0x2C", "\x54\x2c", arrays in C and lists in
-Python. Comments are written as in Python or C. A line may begin with a time such as [12:00:01.123],
-or with an offset. It may end with the bytes as characters. The tools xxd, hexdump -C, tcpdump and
-Wireshark print such lines. Lines of candump, tables of logic analysers and annotations of sigrok
-are supported as well.
+Python, with comments. Lines may have a time such as [12:00:01.123] or an offset, and the bytes as
+characters, as in the output of xxd, hexdump -C, tcpdump and Wireshark. Lines of candump, tables of
+logic analysers and annotations of sigrok are supported as well.
 
-Each format is recognised by a feature that no other format has. Ambiguous text is an error;
-`AMBIGUOUS` has the error messages.
+Ambiguous text is an error.
 """
 
 from __future__ import annotations
@@ -86,7 +84,7 @@ AMBIGUOUS = {
 
 
 class HexText:
-    """Reads a text line by line. Comments, arrays and dumps may extend over several lines."""
+    """Reads a text line by line, with comments and arrays over several lines."""
 
     def __init__(self) -> None:
         self._in_comment = self._in_array = False
@@ -132,8 +130,7 @@ class HexText:
         """Return the bytes and the time of a line in one of the `FORMS`, else None.
 
         Raises:
-            ValueError: if the line comes from another bus or sender than the lines before, or if
-                its length field does not match its bytes.
+            ValueError: if the line contradicts the lines before, or has a wrong length field.
         """
         matched = next((match for form in FORMS if (match := form.fullmatch(text))), None)
         if matched is None:
@@ -151,10 +148,7 @@ class HexText:
         return Chunk(data, _to_ns(groups.get("at")))
 
     def _read_table_line(self, text: str) -> Chunk | None:
-        """Return the byte and the time in a line of a table; None for other lines.
-
-        The first line of a table names the columns.
-        """
+        """Return the byte and the time in a line of a table; None for other lines."""
         if self._columns is None:
             names = [name.strip(' "').lower() for name in text.split(",")]
             values = [index for index, name in enumerate(names) if name in ("value", "data")]
@@ -177,11 +171,7 @@ class HexText:
         return Chunk(_parse_word(value) if value else b"", _to_ns(at))
 
     def _read_dump_line(self, text: str) -> bytes | None:
-        """Return the bytes of a line of a dump; None for other lines.
-
-        Such a line begins with an offset. Either a colon follows the offset, or the offset is equal
-        to the number of bytes in the lines before.
-        """
+        """Return the bytes of a line of a dump; None for other lines."""
         match = _ROW.fullmatch(text)
         if match is None:
             return None
@@ -281,14 +271,11 @@ def _to_ns(seconds: str | None) -> int | None:
 def _parse_dump_bytes(text: str) -> bytes:
     """Return the bytes of a line of a dump.
 
-    At the end of the line, the bytes may be repeated as characters, between "|" or after several
-    blanks.
-
     Args:
         text: the line without its offset.
 
     Raises:
-        ValueError: if the characters do not match the bytes.
+        ValueError: if the characters in the line do not match its bytes.
     """
     text, bar, _ = text.partition("  |")
     data = b""
@@ -319,10 +306,7 @@ def _parse_dump_bytes(text: str) -> bytes:
 
 
 def _can_represent(characters: str, data: bytes) -> bool:
-    """Return whether characters represent the first bytes of `data`.
-
-    "." and characters outside ASCII can represent any byte.
-    """
+    """Return whether characters represent the first bytes of `data`."""
     pairs = zip(characters, data, strict=False)
     return len(characters) <= len(data) and all(
         ord(character) == byte or character == "." or not character.isascii()
@@ -355,7 +339,7 @@ def _parse_word(word: str) -> bytes:
 def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
     """Yield the bytes of hexadecimal text, one chunk for each line.
 
-    A line that is longer than `BLOCK_BYTES` yields several chunks.
+    A line that is longer than `BLOCK_BYTES` is returned in several chunks.
 
     Args:
         name: the name of the file, for messages.
@@ -390,10 +374,7 @@ def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
 
 
 def find_cut(text: str) -> int:
-    """Return an index at which hexadecimal text can be split.
-
-    It is directly before or after the last separator. Without a separator, it is between two bytes.
-    """
+    """Return an index at which hexadecimal text can be split."""
     return (
         max(
             *(text.rfind(mark) + 1 for mark in " \t\n,;:{}"), *(text.rfind(mark) for mark in "\\/#")

@@ -1,7 +1,6 @@
 """The clock of this computer for arrival times.
 
-`HostClock` reads the wall clock once and then adds the time of a steady clock. The interval between
-two arrival times is therefore correct even if the wall clock is set in between.
+Setting the wall clock does not change `HostClock`, so intervals between arrival times are correct.
 """
 
 from __future__ import annotations
@@ -25,9 +24,6 @@ _CLOCK_BOOTTIME: int | None = getattr(time, "CLOCK_BOOTTIME", None)
 class HostClock:
     """A clock that starts at the wall-clock time and never jumps.
 
-    Intervals between its times are correct even if the wall clock is set or the computer is
-    suspended.
-
     Args:
         wall: returns the time of the wall clock, ns since 1970.
     """
@@ -48,8 +44,7 @@ class HostClock:
     def now_and_wall(self) -> tuple[int, int]:
         """Return the times of this clock and of the wall clock, ns since 1970.
 
-        Both clocks are read at almost the same moment. If the thread is suspended between the two
-        readings, both clocks are read again.
+        Both clocks are read at almost the same moment.
         """
         closest: tuple[int, int, int] | None = None
         for _ in range(_READ_ATTEMPTS):
@@ -64,10 +59,7 @@ class HostClock:
         return closest[1:]
 
     def find_step(self) -> int | None:
-        """Return wall clock minus this clock in ns, if the wall clock was set.
-
-        Returns None if the difference has changed by at most 50 ms since it was last returned.
-        """
+        """Return wall clock minus this clock, ns; None if the difference is unchanged."""
         offset_ns, read_time_ns = self._read_offset()
         lead_ns = offset_ns - self._offset_ns
         if abs(lead_ns - self._lead_ns) <= _SET_CLOCK_NS or read_time_ns > _MAX_READ_TIME_NS:
@@ -83,10 +75,7 @@ class HostClock:
 
 
 def steady_ns() -> int:
-    """Return the time of a clock that is never set, in ns.
-
-    If the system supports it, the clock also runs while the computer is suspended.
-    """
+    """Return the time of a clock that is never set, in ns."""
     if _CLOCK_BOOTTIME is None:
         return time.monotonic_ns()
     return time.clock_gettime_ns(_CLOCK_BOOTTIME)

@@ -1,8 +1,7 @@
 """Send requests to the web server of a sensor.
 
-A request is a frame of `HttpRequest` (method, path, body), and a reply is a frame of `HttpReply`
-(status, body). The duration of a request and the size of its reply are limited. A request is sent
-only after the reply to the previous request has arrived.
+A request is a frame of `HttpRequest`, and a reply is a frame of `HttpReply`. A request is sent only
+after the reply to the previous request has arrived.
 """
 
 from __future__ import annotations
@@ -24,11 +23,10 @@ from lidarspec.transports.protocol import Chunk, LiveTransport
 class HttpTransport(LiveTransport):
     """Sends HTTP requests to a host, in the thread that calls `read`.
 
-    If a request fails, `read` returns no reply, and `warnings` contains the reason.
+    If a request fails, `warnings` contains the reason.
 
     Args:
-        host: name or address of the sensor.
-        link: the declared link, with its port and its limits of time and size.
+        link: the declared link, with port, timeout and maximum size of a reply.
     """
 
     datagrams = True

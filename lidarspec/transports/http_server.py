@@ -1,7 +1,6 @@
 """Serve HTTP requests to a simulated sensor.
 
-The server of the standard library parses each request in a separate thread. The thread passes the
-request to the simulated sensor as a frame of `HttpRequest`, and waits until the sensor sends a
+The server passes each request to the simulated sensor as a frame of `HttpRequest`, and waits for a
 frame of `HttpReply`. If no reply arrives in time, the status is 504.
 """
 

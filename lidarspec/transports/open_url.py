@@ -1,7 +1,4 @@
-"""Open the transport of a SOURCE.
-
-A SOURCE is a text that names an input: a file, a port, a URL, or a device of `lidarspec.toml`.
-"""
+"""Open the transport of a SOURCE: a file, a port, a URL or a device name."""
 
 from __future__ import annotations
 
@@ -42,7 +39,8 @@ def open_transport(source: str | Path, sensor: Sensor | None = None) -> Transpor
 
     Args:
         source: a file, "-", a port, a URL, or the name of a device in `lidarspec.toml`.
-        sensor: provides the defaults of baud rate, control lines and ports; None for no defaults.
+        sensor: the sensor whose baud rate, control lines and ports are the defaults; None for no
+            defaults.
 
     Raises:
         UsageError: for an unknown scheme, or an option that this kind of source does not accept.
@@ -71,11 +69,11 @@ def open_live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport
 
     Args:
         source: a port, a URL, or the name of a device in `lidarspec.toml`.
-        sensor: provides the defaults of baud rate, control lines and ports; None for no defaults.
+        sensor: the sensor whose baud rate, control lines and ports are the defaults; None for no
+            defaults.
 
     Raises:
-        UsageError: for a file, an unknown scheme, or an option that this kind of source does not
-            accept.
+        UsageError: for a file, an unknown scheme, or an unknown option.
         SourceError: if the source cannot be opened.
     """
     opened = open_transport(source, sensor)
@@ -126,12 +124,11 @@ def has_control(source: str | Path) -> bool:
 
 
 def control_link(source: str | Path, name: str, link: Link, host: str | None) -> LiveTransport:
-    """Open the transport of a link that is used for commands but not for data.
+    """Open the transport of a link for commands without data.
 
     Args:
-        source: the SOURCE of the data. Its option ``control=HOST[:PORT]`` has priority over `host`.
+        source: the SOURCE of the data. Its option ``control=HOST[:PORT]`` overrides `host`.
         name: the name of the link.
-        link: the link, as declared by the sensor.
         host: the sensor's address; None if it is unknown.
 
     Raises:
@@ -194,10 +191,7 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
 
 
 def _open(address: SourceAddress, sensor: Sensor | None) -> Transport:
-    """Open a SOURCE with a scheme.
-
-    Schemes that are not built in are opened by plugins.
-    """
+    """Open a SOURCE with a scheme."""
     if address.scheme in SCHEMES:
         module = importlib.import_module(f"lidarspec.transports.{SCHEMES[address.scheme]}")
         opened: Transport = module.connect(address, sensor)

@@ -1,12 +1,10 @@
 """Send bytes like a sensor, over pseudo-terminals, UDP, TCP and HTTP.
 
-Simulated sensors and replays use outlets. An `OutletLine` is the sensor's end of one link. It sends
-bytes without waiting, and returns the commands that have arrived. An `Outlet` contains the line of
-the data link and the lines of the sensor's other links, and waits for all of them together.
+An `OutletLine` is the sensor's end of one link. It sends bytes and returns commands without
+waiting. An `Outlet` contains all lines of a sensor. Simulated sensors and replays use outlets.
 
-Like a real sensor, an outlet also sends if no program listens. It counts the bytes that were not
-read. With `patient=True`, it waits for a slow reader instead of dropping bytes. Replays use this,
-because all their bytes must arrive, and so do simulated sensors that run as fast as they are read.
+Like a real sensor, an outlet also sends if no program listens. With `patient=True`, it waits for a
+slow reader instead of dropping bytes.
 """
 
 from __future__ import annotations
@@ -67,7 +65,7 @@ class OutletLine:
     Attributes:
         local_source: the SOURCE with which a program on this computer opens the link.
         port: the port that the line listens on; 0 if it does not listen.
-        has_listener: whether a program receives the bytes; True if this is unknown.
+        has_listener: whether a program receives the bytes; True if unknown.
         unsent_bytes: number of bytes that were not read in time.
     """
 
@@ -95,10 +93,7 @@ class OutletLine:
         return ()
 
     def receive(self) -> list[bytes]:
-        """Return the commands that have arrived, without waiting.
-
-        Also writes waiting bytes, and accepts and closes connections.
-        """
+        """Return the commands that have arrived, and write waiting bytes."""
         return []
 
     def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
@@ -114,13 +109,10 @@ class OutletLine:
         raise NotImplementedError
 
     def redirect(self, host: str, port: int) -> None:
-        """Change the address to which datagrams are sent.
-
-        Lines without datagrams ignore this.
+        """Change the address to which datagrams are sent; other lines ignore this.
 
         Args:
             host: the address; "" for the same address as before.
-            port: the port.
         """
 
     def await_listener(self) -> bool:
@@ -151,8 +143,8 @@ class _SendBuffer:
     """Bytes that wait for a slow reader.
 
     Args:
-        write: writes without waiting, and returns the number of bytes that were written.
-        max_bytes: the maximum number of waiting bytes that `has_room` allows.
+        write: writes without waiting, and returns the number of written bytes.
+        max_bytes: maximum number of waiting bytes.
     """
 
     def __init__(self, write: Callable[[bytearray], int], max_bytes: int) -> None:
@@ -186,13 +178,9 @@ class _SendBuffer:
 class UdpLine(OutletLine):
     """Sends UDP datagrams to a host, or to the sender of the last command.
 
-    `UdpLine.to` and `UdpLine.make_reply_line` make a line.
-
     Attributes:
-        takes_commands: whether the line receives commands. If so, the data is sent to the sender of
-            the last command.
-        waits_for_address: whether the destination port is unknown until a command contains it.
-            Datagrams that are sent before this command are lost.
+        takes_commands: whether the line receives commands.
+        waits_for_address: whether datagrams are dropped until a command contains their destination.
     """
 
     takes_commands = False
@@ -229,9 +217,8 @@ class UdpLine(OutletLine):
         """Return a line that sends to a host, and accepts commands only from that host.
 
         Args:
-            host: name or address.
-            ports: the destination ports. If there is one port, all datagrams are sent to it.
-                Otherwise, each datagram is sent to the port of its `receiver`.
+            ports: the destination ports. With several ports, each datagram is sent to the port of
+                its `receiver`.
             default_port: the destination port of datagrams without a receiver; 0 for none.
             takes_commands: whether commands are sent to this line.
 
@@ -268,7 +255,7 @@ class UdpLine(OutletLine):
     def make_reply_line(cls, host: str, port: int) -> UdpLine:
         """Return a line that replies to the sender of the last command.
 
-        The line also receives broadcasts that are sent on this computer.
+        The line also receives broadcasts of this computer.
 
         Args:
             host: the address to listen on.
@@ -288,10 +275,7 @@ class UdpLine(OutletLine):
 
     @property
     def source(self) -> str:
-        """The SOURCE for the receiving computer.
-
-        It contains no host, because datagrams may arrive at any interface of that computer.
-        """
+        """The SOURCE for the receiving computer, without a host."""
         if not self._host or self._host == LOCALHOST:
             return self.local_source
         return "udp://" + _format_ports(self._ports)
@@ -330,10 +314,7 @@ class UdpLine(OutletLine):
             opened.close()
 
     def _listen_for_commands(self) -> None:
-        """Receive commands from now on.
-
-        If the data is sent to this computer, the port for commands is added to `local_source`.
-        """
+        """Receive commands from now on."""
         self.takes_commands = True
         if self._host == LOCALHOST:
             self._sockets[0].bind((LOCALHOST, 0))
@@ -368,12 +349,10 @@ class UdpLine(OutletLine):
         return False
 
     def _may_succeed_later(self, error: OSError) -> bool:
-        """Return whether sending a datagram again may succeed.
-
-        If the error requires a pause before the datagram is sent again, this waits.
+        """Return whether sending may succeed later, after any necessary pause.
 
         Raises:
-            SourceError: if sending again cannot succeed, and the user has named the receiver.
+            SourceError: if sending fails, and the user has named the receiver.
         """
         if error.errno in (errno.EAGAIN, errno.EWOULDBLOCK):
             wait_ready([], [self._sockets[0]], POLL_S)
@@ -398,7 +377,7 @@ class TcpLine(OutletLine):
         host: the address to listen on.
         port: the port to listen on; 0 selects any free port.
         sole: whether only one connection at a time is accepted.
-        is_reported: whether the sensor reports the port, so that the SOURCE does not contain it.
+        is_reported: whether the sensor reports its port, so that the SOURCE contains none.
 
     Raises:
         SourceError: if the address is not available.
@@ -468,16 +447,12 @@ class TcpLine(OutletLine):
         self._listener = listen(self._host, self.port)
 
     def finish(self) -> None:
-        """Disconnect all clients after they have received the last bytes.
-
-        Closing a socket with unread input would discard bytes that were not yet received. Input is
-        therefore read and ignored until the client closes the connection, or `FETCH_TIMEOUT_S` has
-        passed.
-        """
+        """Disconnect all clients after they have received the last bytes."""
         limit = time.monotonic() + FETCH_TIMEOUT_S
         for client in list(self._clients):
             with contextlib.suppress(OSError):
                 client.shutdown(socket.SHUT_WR)
+                # closing a socket with unread input discards bytes that were not yet received
                 while (remaining := limit - time.monotonic()) > 0:
                     client.settimeout(remaining)
                     if not client.recv(_READ_BYTES):
@@ -523,10 +498,10 @@ class TcpLine(OutletLine):
 class PtyLine(OutletLine):
     """A pseudo-terminal (POSIX only), which programs open by its path.
 
-    If no program has opened it, sent bytes are lost, as on a serial cable.
+    Bytes that are sent before a program opens the terminal are lost.
 
     Args:
-        link: path of a symbolic link to the terminal. It is created and removed with the terminal.
+        link: path of a symbolic link to the terminal, which is created and removed with it.
 
     Attributes:
         path: the path of the terminal; it changes with each `plug`.
@@ -544,11 +519,9 @@ class PtyLine(OutletLine):
 
     @property
     def max_wait_s(self) -> float:
-        """The maximum time between two checks for a reader, in seconds.
-
-        The checks are necessary because opening the terminal causes no event.
-        """
+        """The maximum time between two checks for a reader, in seconds."""
         if self._master >= 0 and not self.has_listener:
+            # opening the terminal causes no event
             return _ABSENT_READER_POLL_S
         return math.inf
 
@@ -699,8 +672,7 @@ class Outlet:
     """The lines of one sensor.
 
     Args:
-        data: the line of the data link.
-        controls: the line of each other link for commands and replies, by the name of the link.
+        controls: name of each other link -> its line.
     """
 
     def __init__(self, data: OutletLine, controls: Mapping[str, OutletLine] | None = None) -> None:
@@ -734,7 +706,7 @@ class Outlet:
         return self.data.unsent_bytes
 
     def receive(self, wait: float) -> list[tuple[str, bytes]]:
-        """Wait for commands on all links, and return (name of the link, bytes) of each.
+        """Wait for commands on all links, and return (link, bytes) of each.
 
         Args:
             wait: maximum time, in seconds.
@@ -789,7 +761,6 @@ def wait_for(lines: Collection[OutletLine], timeout: float) -> None:
     """Wait until a line has input, or can send waiting bytes.
 
     Args:
-        lines: the lines.
         timeout: maximum time, in seconds.
     """
     timeout = min([timeout, *(line.max_wait_s for line in lines)])

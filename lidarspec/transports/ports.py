@@ -27,9 +27,9 @@ class SerialPort:
     Attributes:
         path: the name of the port, such as "/dev/ttyUSB0" or "COM4".
         description: the system's description of the device.
-        lasting: a name of the port that stays the same in every USB socket; "" if it has none.
+        lasting: a name of the port that does not depend on the USB socket; "" if there is none.
         allowed: whether the current user may open the port.
-        users: the programs that have opened the port, as far as the system shows them.
+        users: the programs that have opened the port, if the system shows them.
     """
 
     path: str
@@ -120,8 +120,7 @@ def find_udp_users(port: int) -> tuple[PortUser, ...] | None:
     """Return the other programs that have opened a UDP port.
 
     Returns:
-        None if the port is free. An empty tuple if it is in use by a program of another user, which
-        is not visible.
+        None if the port is free; an empty tuple if a program of another user has opened it.
     """
     inodes = set()
     for table in _UDP_TABLES:
@@ -169,10 +168,7 @@ def received_per_interface() -> dict[str, int]:
 
 
 def filters_senders(interface: str) -> bool:
-    """Return whether an interface drops packets from senders in other networks.
-
-    It does so if the Linux setting rp_filter is 1 (strict).
-    """
+    """Return whether an interface drops packets from senders in other networks."""
     with contextlib.suppress(OSError):
         values = [
             Path(f"/proc/sys/net/ipv4/conf/{name}/rp_filter").read_text(encoding="ascii").strip()

@@ -1,7 +1,7 @@
 """Base classes for transports and file formats, which plugins can add.
 
 A `Transport` yields `Chunk`s and sends bytes. A `LiveTransport`, such as a port, does not end by
-itself. Derived classes override the attributes that differ from the defaults.
+itself.
 """
 
 from __future__ import annotations
@@ -67,10 +67,10 @@ def endpoint(sender: Sender) -> str:
 
 
 def name_senders(ends: Iterable[tuple[Sender | None, Sender | None]]) -> dict[Sender | None, str]:
-    """Return a name for each sender: its address, or ADDRESS:PORT if necessary.
+    """Return a name for each sender: its address, with the port if necessary.
 
-    The name includes the port if several ports of the address send to the same receiving port. The
-    name of an unknown sender is "".
+    The port is necessary if several ports of the address send to the same port. The name of an
+    unknown sender is "".
 
     Args:
         ends: (sender, receiver) of each datagram.
@@ -94,7 +94,7 @@ class Format:
     Args:
         suffix: the suffix including the dot, ".csv".
         description: a short description for lists.
-        write: writes scans to a path. With `every_point`, it also writes points without a return.
+        write: writes scans to a path. With `every_point`, points without a return are written too.
         holds: the names of optional features that the format supports:
             "organized": points in rows and columns. `write` then accepts `organized=True` with one
             scan.
@@ -123,9 +123,10 @@ class Chunk:
         at: arrival time, ns since 1970; None if unknown.
         sender: (address, port) of the sender of a datagram; None for a stream, or if unknown.
         receiver: (address, port) to which a datagram was sent; None for a stream, or if unknown.
-        gap: whether data is missing before this chunk. An incomplete frame before it is discarded.
-        quiet: whether the line was silent before this chunk. An incomplete frame before it is
+        gap: whether data is missing before this chunk. An incomplete frame before the gap is
             discarded.
+        quiet: whether the line was silent before this chunk. An incomplete frame before the silence
+            is discarded.
     """
 
     data: bytes
@@ -191,7 +192,7 @@ class Transport(ABC):
     def progress(self) -> tuple[int, int] | None:
         """(number of bytes read, size) of a file; None if unknown.
 
-        Both are numbers of compressed bytes if the file is compressed.
+        For a compressed file, both are numbers of compressed bytes.
         """
         stored: Any = self.stored
         if stored is None or not stored.seekable():
@@ -230,7 +231,7 @@ def no_bytes_message(source: str | Path, warnings: Sequence[str]) -> str:
     """Return the error message for a file without bytes.
 
     Args:
-        warnings: the warnings of the file's transport, which may give the reason.
+        warnings: the warnings of the file's transport.
     """
     return "; ".join(warnings) or f"{source} contains no bytes"
 
@@ -246,12 +247,12 @@ class LiveTransport(Transport):
     """A transport that does not end by itself: a port, a socket, a simulated device.
 
     Attributes:
-        label: the SOURCE as given by the user, for messages.
+        label: the SOURCE, for messages.
         closed: whether the transport was closed. `chunks` then ends.
-        overflow: the default policy if the queue of chunks is full: "drop_oldest", or "block" for a
+        overflow: the default policy for a full queue of chunks: "drop_oldest", or "block" for a
             source that waits for its reader.
-        silence: seconds without a byte after which an incomplete frame is discarded.
-        other_sender: the sender of the last `foreign` datagram; None if there was none.
+        silence: number of seconds without a byte after which an incomplete frame is discarded.
+        other_sender: the sender of the last datagram in `foreign`; None if there was none.
     """
 
     label: str = ""
@@ -281,14 +282,14 @@ class LiveTransport(Transport):
     def connect_to(self, port: int) -> None:
         """Connect to a port that the sensor has reported.
 
-        Sources with a fixed port do nothing.
+        A source with a fixed port ignores this.
 
         Raises:
             SourceError: if the connection fails.
         """
 
     def accept(self, sender: Sender) -> None:
-        """Set the destination of `write` to the sender that was found to be the sensor.
+        """Set the destination of `write` to the detected sensor.
 
         A source with a fixed destination ignores this.
         """
@@ -333,7 +334,7 @@ class LiveTransport(Transport):
         """Open the transport of another link of the same device.
 
         Returns:
-            The transport; None if the caller must open it at the address of the link.
+            The transport; None if the caller must open the link by its address.
         """
         return None
 

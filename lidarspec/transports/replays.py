@@ -1,7 +1,7 @@
 """Send the bytes of a recording at their recorded times, or at another speed.
 
-Each chunk has a deadline on the monotonic clock. All deadlines are computed from the deadline of
-the first chunk, so that delays do not add up. A late chunk is sent at once.
+All deadlines are computed from the deadline of the first chunk, so that delays do not add up. A
+late chunk is sent at once.
 """
 
 from __future__ import annotations
@@ -29,10 +29,6 @@ _MAX_REORDERING_NS = _SECOND_NS
 class Deadlines:
     """Computes the deadline of each chunk of a replay, in ns of the monotonic clock.
 
-    Recorded times may go back. If a time is earlier than a previous time by at most one second,
-    datagrams were reordered, and the chunk is sent at once. If it is earlier by more, a clock was
-    set, and the following deadlines are computed from the new time.
-
     Args:
         speed: 2.0 is twice as fast as recorded; None is as fast as possible.
         start: the deadline of the first chunk.
@@ -48,14 +44,14 @@ class Deadlines:
         """Return the deadline of the next chunk.
 
         Args:
-            at: the recorded arrival time of the chunk, ns; None if it is unknown. A chunk without a
-                time is due at the start.
+            at: the recorded arrival time of the chunk, ns; None if unknown.
         """
         if self._speed is None or at is None:
             return self._start
         if self._origin is None:
             self._origin = at
             self._latest = at
+        # a small step back is a reordered datagram; after a large step, a clock was set
         elif at < self._latest - _MAX_REORDERING_NS:
             self._origin += at - self._latest
             self._latest = at
@@ -73,7 +69,6 @@ def iter_paced(
     """Yield each chunk at its deadline, with its delay in ns.
 
     Args:
-        chunks: the recorded chunks.
         speed: 2.0 is twice as fast as recorded; None is as fast as possible.
         now: returns the time, ns.
         sleep: waits for a number of seconds.
@@ -95,11 +90,10 @@ class Replay:
         file: the SOURCE of a recording, capture or raw file.
         destination: an outlet, or a new file; it is not closed.
         speed: 2.0 is twice as fast as recorded; None is as fast as possible.
-        needs_times: whether a file without times is an error. Otherwise, such a file is sent as
-            fast as possible.
-        loop: whether to start again at the end. Each listener receives the file from the beginning.
-        source: the transport of the file if it is already open, for example standard input. It is
-            used for the first pass, and then closed.
+        needs_times: whether a file without times is an error. Otherwise, the file is sent as fast
+            as possible.
+        loop: whether to start again at the end.
+        source: the open transport of the file, for example standard input; None to open the file.
         times: the range of arrival times to send, as for `Selection(times=...)`.
 
     Attributes:
@@ -149,9 +143,9 @@ class Replay:
         return set(name_senders(self._endpoints).values()) - {""}
 
     def run(self) -> Iterator[str]:
-        """Send the file once, or repeatedly if `loop` is set.
+        """Send the file once, or repeatedly if `loop` is set; yield messages.
 
-        Yields a message for the user, or "", after each chunk.
+        If there is no message for the user after a chunk, "" is yielded.
 
         Raises:
             UsageError: if the file has no times, but they are required.
@@ -195,11 +189,7 @@ class Replay:
             self._destination.write(chunk)
 
     def _check_times(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
-        """Yield the chunks, and check that each chunk has a time.
-
-        A chunk without a time raises an error if times are required. Otherwise, `is_timed` is set
-        to False.
-        """
+        """Yield the chunks; raise an error if a required time is missing."""
         for chunk in chunks:
             if chunk.at is None and self._speed is not None and self.is_timed:
                 if self._needs_times:

@@ -1,17 +1,15 @@
 """Read packets from robotics logs: ROS 1 bags, ROS 2 bags and MCAP files.
 
-A driver publishes each packet as a message, or all packets of a scan as a list in one message. A
-message type contains packets if it has a field `packets`, or "packet" in its name. The bytes of a
-packet are in its field `data` or `buf`. If the packet has a field `size`, only this number of bytes
-is used. A packet may have a field `stamp`.
+A driver publishes a packet, or a list of the packets of a scan, as a message. A message type
+contains packets if it has a field `packets`, or "packet" in its name. The bytes are in the field
+`data` or `buf` of a packet. The optional fields are `size`, the number of bytes, and `stamp`.
 
-Most logs contain the definitions of their messages. Some logs do not, for example ROS 2 bags in
-SQLite that were written by releases before Iron. Their messages are read with the definition in
+Some logs contain no definitions of their messages. Their messages are read with the definition in
 `FALLBACK_DEFINITIONS` that matches the length of the message.
 
-lidarspec and its ROS 2 node write packets as std_msgs/UInt8MultiArray, because every ROS release
-has this message type. The first `data_offset` bytes of the data are the arrival time. The label of
-the array's dimension is `DATAGRAM` or `STREAM`.
+lidarspec writes packets as std_msgs/UInt8MultiArray, because every ROS release has this message
+type. The first `data_offset` bytes of the data are the arrival time. The label of the array's
+dimension is `DATAGRAM` or `STREAM`.
 """
 
 from __future__ import annotations
@@ -54,13 +52,13 @@ STREAM = "stream"
 
 
 class LogKind(NamedTuple):
-    """A kind of log.
+    """A kind of log, such as a ROS 1 bag.
 
     Attributes:
-        description: name of the kind, for messages to the user.
+        description: name of the kind, for messages.
         module: name of the module of rosbags that reads the log.
         reader: name of the class that reads the log, in `module`.
-        form: the serialization format of the messages in the log, "cdr" or "ros1".
+        form: the serialization format of the messages, "cdr" or "ros1".
     """
 
     description: str
@@ -84,12 +82,7 @@ FOLDER = LogKind("a ROS 2 bag", "rosbags.rosbag2", "Reader")
 
 
 def find_log_kind(path: str, head: bytes = b"") -> LogKind | None:
-    """Return the kind of a log; None if the file or folder is not a log.
-
-    Args:
-        path: the file or folder.
-        head: the first bytes of the file.
-    """
+    """Return the kind of a log; None if the file or folder is not a log."""
     if os.path.isdir(path):
         if os.path.isfile(os.path.join(path, "metadata.yaml")):
             return FOLDER
@@ -100,13 +93,10 @@ def find_log_kind(path: str, head: bytes = b"") -> LogKind | None:
 class BagTransport(Transport):
     """Reads the packets of a robotics log, in the order of its messages.
 
-    The time of a packet is its own stamp. A packet without a stamp has the stamp of its message, or
-    else the time at which the message was logged. All topics of a namespace belong to one sensor.
+    The time of a packet is its own stamp, or else the stamp of its message or the time of logging.
     If several namespaces have packets, the `sender` of each chunk is its namespace.
 
     Args:
-        path: the file or folder.
-        log: the kind of the log.
         sender: yield only the packets of this namespace or topic; None for all.
     """
 
@@ -189,10 +179,7 @@ class BagTransport(Transport):
         self._log.close()
 
     def _deserialize(self, link: Any, raw: bytes) -> Any:
-        """Return a message; None if no definition fits it.
-
-        The first definition that fits is used for all following messages of the connection.
-        """
+        """Return a message; None if no definition fits it."""
         stores = self._type_stores[link.id]
         for store in stores:
             try:
@@ -244,11 +231,7 @@ def _read_stamp(stamped: Any) -> int:
 
 
 def _make_type_stores(link: Any) -> list[Any]:
-    """Return a type store for each possible definition of a connection's messages.
-
-    Returns:
-        An empty list if the messages contain no packets.
-    """
+    """Return a type store for each possible definition of a connection's messages."""
     typesys = import_library("rosbags.typesys", "ros")
     if link.msgtype == RAW and "packets" in link.topic:
         return [typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)]
@@ -290,11 +273,7 @@ def _has_packets(types: Mapping[str, Any], name: str) -> bool:
 
 
 def _find_element_type(field: Any) -> Any:
-    """Return the element type of an array field; None for other fields.
-
-    Returns:
-        The name of a message type; for numbers, a tuple (number type, length).
-    """
+    """Return the element type of an array field; None for other fields."""
     if field is not None and field[0].name in ("ARRAY", "SEQUENCE"):
         return field[1][0][1]
     return None

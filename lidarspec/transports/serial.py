@@ -1,11 +1,11 @@
 """Read and write serial ports.
 
-A port is opened exclusively. When a device that was unplugged is back, its port can be opened
-again. If the device disappears, pyserial raises SerialException, OSError or `termios.error`, which
-is not an OSError. If another thread closes the port during a read, pyserial raises TypeError.
+A port is opened exclusively. After a disconnection, it can be opened again. If the device
+disappears, pyserial raises SerialException, OSError or `termios.error`. If another thread closes
+the port during a read, pyserial raises TypeError.
 
-On POSIX systems, the port is read through its descriptor. After each read, the thread pauses, so
-that it does not wake up for every byte of a fast line.
+On POSIX systems, the port is read through its descriptor, with pauses between reads, so that the
+thread does not wake up for every byte.
 """
 
 from __future__ import annotations
@@ -57,12 +57,11 @@ class SerialTransport(StreamTransport):
         baud: the baud rate.
         dtr: level of the control line DTR while the port is open; None does not set it.
         rts: level of the control line RTS while the port is open; None does not set it.
-        sensor: the sensor; None if unknown. Its longest frame determines after how many seconds
-            without data the line counts as silent.
+        sensor: the sensor; None if unknown. Its longest frame determines when the line counts as
+            silent.
 
     Raises:
-        SourceError: if the port is missing or in use, if the user may not open it, or if it does
-            not support the baud rate.
+        SourceError: if the port cannot be opened, or does not support the baud rate.
     """
 
     baud: int
@@ -98,10 +97,8 @@ class SerialTransport(StreamTransport):
             raise disconnected_error(self.label, error) from None
 
     def _send(self, descriptor: int, left: memoryview) -> None:
-        """Write all bytes through the descriptor.
-
-        pyserial is not used for this, because its `select` supports only descriptors up to 1,023.
-        """
+        """Write all bytes through the descriptor."""
+        # the `select` of pyserial supports only descriptors up to 1,023
         limit = time.monotonic() + WRITE_TIMEOUT_S
         while left:
             if not wait_ready([], [descriptor], max(limit - time.monotonic(), 0.0))[1]:
@@ -197,8 +194,7 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SerialTrans
     Examples are "serial:///dev/ttyUSB0?baud=230400&dtr=0", "/dev/ttyUSB0" and "COM4".
 
     Args:
-        address: the SOURCE.
-        sensor: provides the defaults of the baud rate and the control lines; None for no defaults.
+        sensor: the sensor whose baud rate and control lines are the defaults; None for no defaults.
 
     Raises:
         UsageError: if the baud rate is unknown, or for an unknown option.

@@ -1,8 +1,7 @@
 """Run a simulated sensor at an outlet, in real time.
 
-A loop passes the bytes that the device sends to the outlet, and the commands that the outlet
-receives to the device. Between two passes, it waits until the device sends again or a command
-arrives. `serve` runs the loop in the calling thread, and `Served` runs it in a new thread.
+A loop sends the bytes of the device to the outlet, and the commands from the outlet to the device.
+`serve` runs the loop in the calling thread, and `Served` runs it in a new thread.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ _VIRTUAL_STEP_NS = 20_000_000
 class VirtualClock:
     """A clock that moves only when `advance` is called, for tests that do not wait.
 
-    The serving thread moves the clock in steps, and sends the data that is due at each step.
+    The serving thread sends the data that is due at each step of the clock.
     """
 
     def __init__(self) -> None:
@@ -69,9 +68,7 @@ class VirtualClock:
 class FairLock:
     """A lock that threads get in the order in which they request it.
 
-    It is used by threads that simulate sensors. Without this lock, or with an ordinary lock, a
-    hundred such threads make hardly any progress, because each of them often waits until all others
-    have released the interpreter lock.
+    With an ordinary lock, a hundred threads that simulate sensors make hardly any progress.
     """
 
     def __init__(self) -> None:
@@ -80,10 +77,10 @@ class FairLock:
 
     @contextlib.contextmanager
     def hold(self, stop: threading.Event) -> Iterator[bool]:
-        """Hold the lock in the context; yield False if `cancel` ended the waiting.
+        """Hold the lock in the context; yield False if `cancel` ended the wait.
 
         Args:
-            stop: an event of the calling thread, which another thread passes to `cancel`.
+            stop: the event that another thread passes to `cancel`.
         """
         ticket = threading.Event()
         with self._lock:
@@ -126,12 +123,10 @@ def serve(
     """Run a device at an outlet.
 
     Args:
-        device: the simulated device.
-        outlet: the outlet.
         seconds: the duration; None for no limit.
         stop: the loop ends when this event is set.
         on_pass: called in every pass of the loop, at least every 50 ms.
-        patient: whether to switch the device on only when a program listens.
+        patient: whether to start the device only when a program listens.
         clock: the clock of the device; None for real time.
 
     Raises:
@@ -190,7 +185,7 @@ def _send_due(
 ) -> None:
     """Send the frames that are due.
 
-    If the rate of the device is infinite, frames are sent as fast as they are read.
+    With an infinite rate, frames are sent as fast as they are read.
 
     Args:
         patient: whether to wait until the data is read.
@@ -218,10 +213,9 @@ def _find_wait(device: SimulatedDevice, outlet: Outlet) -> float:
 def due_chunks(
     device: SimulatedDevice, now: int, arrival_ns: int | None = None
 ) -> dict[str, list[Chunk]]:
-    """Advance a device to the time `now`, and return the bytes it sends, by link.
+    """Advance a device to the time `now`; return (link, bytes) of the sent data.
 
     Args:
-        device: the simulated device.
         now: the device's time, ns.
         arrival_ns: the arrival time of all chunks, ns since 1970; None if unknown.
     """
@@ -236,11 +230,7 @@ def due_chunks(
 
 
 def _find_endpoint(sensor: Sensor, frame: str) -> Sender:
-    """Return the address and port that a simulated datagram is sent to.
-
-    This is the first declared port for data frames, and the second declared port for all other
-    frames.
-    """
+    """Return the address and port to which datagrams of a frame type are sent."""
     link = sensor.links.get("data")
     ports = link.ports[:2] if isinstance(link, Udp) else ()
     if not ports:
@@ -254,13 +244,11 @@ class Served(ClosingContext):
 
     Args:
         device: the simulated device.
-        outlet: the outlet.
-        patient: whether to switch the device on only when a program listens.
+        patient: whether to start the device only when a program listens.
         clock: the clock of the device; None for real time.
 
     Attributes:
-        device: the simulated device. Its attribute `commands_received` has the recognized commands.
-        outlet: the outlet.
+        device: the simulated device.
     """
 
     def __init__(
@@ -300,14 +288,13 @@ class Served(ClosingContext):
         self._call_in_thread(lambda: self.device.start(get_now()))
 
     def jump_clock(self, seconds: float) -> None:
-        """Let the sensor's clock jump; the jump happens within a quarter of a second.
+        """Let the sensor's clock jump within a quarter of a second.
 
         Args:
             seconds: size of the jump; negative to jump back.
 
         Raises:
-            UsageError: if the sensor has no clock, if its clock cannot be written, or if no data is
-                sent.
+            UsageError: if the sensor has no writable clock, or if no data is sent.
         """
         failures = list[UsageError]()
 
@@ -329,7 +316,7 @@ class Served(ClosingContext):
     def advance(self, seconds: float) -> None:
         """Advance the virtual clock, and wait until all data that is due was sent.
 
-        If no program has opened the port, this first waits until a program opens it.
+        Waits first until a program has opened the port.
 
         Raises:
             UsageError: if the port runs in real time.
@@ -353,9 +340,8 @@ class Served(ClosingContext):
     def wait_for_commands(self, names: Sequence[str], *, timeout: float = 10.0) -> None:
         """Wait until the device has received exactly these commands, in this order.
 
-        A program may continue before the device has read its last command, so a test that compares
-        `device.commands_received` at once can fail at random. Repeated commands count once, because
-        a program repeats a command if the reply is late.
+        Use this instead of comparing `device.commands_received`, because the device may read its
+        last command later. Repeated commands count once.
 
         Args:
             names: the names of all commands since the port was opened.
@@ -376,7 +362,7 @@ class Served(ClosingContext):
             time.sleep(_MIN_PAUSE_S)
 
     def stop_sending(self) -> None:
-        """Stop sending. Bytes that were already sent can still be read."""
+        """Stop sending; bytes that were already sent can still be read."""
         _SIMULATION_LOCK.cancel(self._stop)
         self._thread.join()
 
@@ -392,20 +378,15 @@ class Served(ClosingContext):
             raise self._failure
 
     def _call_in_thread(self, function: Callable[[], None]) -> None:
-        """Call a function in the serving thread, and wait until it was called.
-
-        It is called between two passes of the loop.
-        """
+        """Call a function in the serving thread, and wait until it was called."""
         self._calls.put(function)
         while not self._calls_done.acquire(timeout=_PASS_TIMEOUT_S):
             if not self._thread.is_alive():
                 raise RuntimeError(f"the simulated {self.device.sensor.id} has ended")
 
     def _make_calls(self) -> None:
-        """Call the queued functions.
-
-        The threads that wait for a function are released in the next pass of the loop.
-        """
+        """Call the queued functions."""
+        # threads that wait for a call are released in the pass after it
         if self._calls_in_pass:
             self._calls_done.release(self._calls_in_pass)
         self._calls_in_pass = 0

@@ -29,14 +29,10 @@ _MIN_READ_INTERVAL_NS = 2_000_000
 class SimulatedTransport(LiveTransport):
     """A link of a simulated device.
 
-    Opening the data link switches the device on. Reading the data link advances the time of the
-    device.
+    Opening the data link starts the device. Reading the data link advances the time of the device.
 
     Args:
         label: the SOURCE, for messages.
-        sensor: the simulated sensor.
-        device: the simulated device.
-        name: the name of the link.
         data: the data link of the same device; None if this is the data link.
 
     Attributes:
@@ -124,10 +120,7 @@ class SimulatedTransport(LiveTransport):
             self._changed.notify_all()
 
     def _next_data_ns(self) -> float:
-        """Return the time at which the device sends data again, ns; inf if unknown.
-
-        The time is known only on the data link, because reading this link advances the device.
-        """
+        """Return the time at which the device sends data again, ns; inf if unknown."""
         if self._name == "data":
             deadline = self.device.deadline
         else:
@@ -137,10 +130,7 @@ class SimulatedTransport(LiveTransport):
         return max(deadline, self._next_read_ns)
 
     def _take(self, now: int) -> list[Chunk]:
-        """Return the unread bytes of this link.
-
-        For the data link, first advances the device.
-        """
+        """Return the unread bytes of this link; advance the device on the data link."""
         if self._name == "data":
             for link, data in self.device.outgoing(now):
                 if link in self._unread:
@@ -161,9 +151,8 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SimulatedTr
     """Open a simulated SOURCE, for example ``sim:ID?rate=2&errors=0.01``.
 
     Args:
-        address: the SOURCE.
-        sensor: the sensor that decodes the data. If the SOURCE has no id, or the id of this sensor,
-            this sensor is simulated with its options.
+        sensor: the sensor that decodes the data. If the SOURCE has no id, or the id of this
+            sensor, this sensor is simulated.
 
     Raises:
         UnknownSensor, UnknownOption, UsageError: for an invalid source.

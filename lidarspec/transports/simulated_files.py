@@ -1,7 +1,6 @@
 """Write the bytes of a simulated sensor to a file, without waiting.
 
-The arrival times in the file are the times of the simulated device. The file equals a recording
-that begins when the device is switched on and opened.
+The file equals a recording that begins when the device is started.
 """
 
 from __future__ import annotations
@@ -35,11 +34,9 @@ def write_file(
 ) -> int:
     """Write the bytes that a device sends in a period after its start.
 
-    The commands that open the device are sent to it and recorded as well. If the device sends no
-    data, no file is created.
+    The opening commands are recorded as well. If the device sends no data, no file is created.
 
     Args:
-        device: the simulated device.
         path: an .lsr, .pcap, .pcapng or .bin file.
         seconds: the duration of the period.
         overwrite: whether an existing file may be replaced.
@@ -49,8 +46,8 @@ def write_file(
 
     Raises:
         UnknownFormat, UsageError: if the file exists, if its format cannot contain the bytes, or if
-            nothing is sent in this time.
-        SpecError: if the declared commands do not start the data of the sensor.
+            nothing is sent.
+        SpecError: if the opening commands do not start the data of the sensor.
         SourceError: if the file cannot be written.
     """
     transfers = _simulate_opened(device, seconds)

@@ -38,8 +38,7 @@ class TcpTransport(StreamTransport):
     """A TCP connection to a sensor.
 
     Args:
-        port: the port; None if the sensor reports a new port for every connection. In this case,
-            `connect_to` opens the connection.
+        port: the port; None if the sensor reports a port, to which `connect_to` connects.
 
     Raises:
         SourceError: if the connection fails.
@@ -87,10 +86,7 @@ class TcpTransport(StreamTransport):
             raise disconnected_error(self.label, error) from None
 
     def reopen(self) -> None:
-        """Open the connection again.
-
-        If the sensor reports the port, this only closes the old connection.
-        """
+        """Close the connection; open it again unless the sensor reports the port."""
         self._close_socket()
         if not self._is_reported:
             self._open(RECONNECT_TIMEOUT_S)
@@ -146,12 +142,10 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> TcpTranspor
     """Open the connection of a TCP SOURCE: "tcp://192.168.1.200:2111".
 
     Args:
-        address: the SOURCE.
-        sensor: the sensor whose port is the default; None for no default. If the sensor reports its
-            port, the connection is opened later.
+        sensor: the sensor whose port is the default; None for no default.
 
     Raises:
-        UsageError: if host or port is missing, or for any option, because TCP has no options.
+        UsageError: if host or port is missing, or for any option.
         SourceError: if the connection fails.
     """
     address.check(())

@@ -1,18 +1,15 @@
-"""Receive the UDP datagrams of a sensor, with arrival times and drop counts from the kernel.
+"""Receive the UDP datagrams of a sensor, with exact arrival times.
 
 Sensors send to the address of this computer or to the broadcast address. Sockets are therefore
-bound to all interfaces ("udp://"), unless the SOURCE contains the address of one interface
+bound to all interfaces ("udp://"), unless the SOURCE contains the address of an interface
 ("udp://127.0.0.1:2368"). Nothing is sent until `write` is called.
 
 Linux stores the arrival time of each datagram, and the number of datagrams that the socket has
-dropped before it. Arrival times are therefore exact, although datagrams accumulate in a short pause
-after each read. The receive buffer stores datagrams while the program does not read. The kernel may
-grant a smaller buffer than requested, so its size is read back.
+dropped. Arrival times are therefore exact, although the thread pauses after each read. The kernel
+may grant a smaller receive buffer than requested.
 
-`ReceiveSlots` fetches many datagrams with one system call, recvmmsg. It uses ctypes, because Python
-has no function for this call. A call for each datagram would be too slow for a fast sensor. Each
-socket call in Python releases the interpreter lock, and if another thread is computing, it takes
-milliseconds to acquire the lock again.
+`ReceiveSlots` fetches many datagrams with one system call, recvmmsg, because one call for each
+datagram is too slow for a fast sensor: each socket call in Python releases the interpreter lock.
 """
 
 from __future__ import annotations
@@ -110,7 +107,7 @@ _CONTROL_SIZE_STEP = ctypes.sizeof(_ReceivedDatagram) // ctypes.sizeof(ctypes.c_
 
 
 class ReceiveSlots:
-    """Buffers for many datagrams. Each call of `fill` overwrites them.
+    """Buffers for many datagrams, which each call of `fill` overwrites.
 
     Raises:
         OSError: if the system has no recvmmsg.
@@ -189,10 +186,9 @@ class ReceiveSlots:
         return data, sender
 
     def single_control_message(self, index: int) -> tuple[int, int, int] | None:
-        """Return the type and the two values of a datagram's only control message.
+        """Return (type, value, value) of a datagram's only control message, or None.
 
-        Returns None unless the datagram has one control message with two 64-bit integers. For
-        datagrams with only an arrival time, this is faster than `control_messages`.
+        For datagrams with only an arrival time, this is faster than `control_messages`.
         """
         control_size = self._control_sizes[_CONTROL_SIZE_INDEX + index * _CONTROL_SIZE_STEP]
         if control_size != _CONTROL_WITH_TWO_INTEGERS.size:
@@ -244,10 +240,10 @@ class UdpTransport(LiveTransport):
             `foreign`. None to accept all.
         datagrams: whether each datagram is a whole frame, not a portion of a byte stream.
         sensor: the sensor, for suggested commands in messages.
-        remote: the destination of `write`. The default is `sender` if it contains a port, else the
-            sender that is passed to `accept`.
-        broadcast: whether `remote` is a broadcast address. If so, `accept` replaces it by the
-            address of the sensor.
+        remote: the destination of `write`; by default `sender` with its port, or the sender that
+            `accept` sets.
+        broadcast: whether `remote` is a broadcast address, which `accept` replaces by the address
+            of the sensor.
 
     Attributes:
         ports: the open ports.
@@ -430,10 +426,9 @@ class _Socket:
         slots: buffers to fetch many datagrams at once; None to fetch single datagrams.
 
     Attributes:
-        address: the local address and port.
         buffer_bytes: size of the receive buffer, including the kernel's overhead.
         is_timed: whether the kernel records the arrival time of each datagram.
-        drops: number of datagrams that the kernel dropped because the buffer was full.
+        drops: number of datagrams that the kernel dropped.
     """
 
     def __init__(self, opened: socket.socket, slots: ReceiveSlots | None) -> None:
@@ -452,10 +447,8 @@ class _Socket:
         """Yield (data, sender, arrival time) of the waiting datagrams; update `drops`.
 
         Args:
-            now: the current time of the transport's clock, ns since 1970. Arrival times are
-                converted to this clock.
-            wall: the time of the wall clock at the same moment, ns since 1970. The kernel uses the
-                wall clock.
+            now: the current time of the transport's clock, ns since 1970.
+            wall: the time of the wall clock at the same moment, ns since 1970.
 
         Raises:
             OSError: if the system call fails.
@@ -500,13 +493,10 @@ class _Socket:
 def _order_times(chunks: list[Chunk], start: int) -> None:
     """Correct arrival times that are later than the times of following chunks.
 
-    In the first milliseconds after a socket was opened, Linux reports the time at which a datagram
-    is fetched instead of its arrival time. This time can be later than the arrival times of the
-    next datagrams.
-
     Args:
         start: index of the first chunk to correct.
     """
+    # just after a socket was opened, Linux reports the time at which a datagram is fetched
     times = [chunk.at or 0 for chunk in chunks[start:]]
     if times == sorted(times):
         return
@@ -535,7 +525,6 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
     "udp://?port=6699,7788&group=239.255.0.1&src=192.168.1.200".
 
     Args:
-        address: the SOURCE.
         sensor: the sensor whose ports are the default; None for no default.
 
     Raises:
@@ -602,9 +591,7 @@ def _find_command_address(address: SourceAddress, link: Udp) -> tuple[Sender | N
 
 
 def warn_of_small_buffer(requested: int, granted: int) -> list[str]:
-    """Return a list with a warning if a receive buffer is smaller than requested.
-
-    Otherwise, the list is empty.
+    """Return a list with a warning if a receive buffer is too small; else empty.
 
     Args:
         requested: the requested size, in bytes.

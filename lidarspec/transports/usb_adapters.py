@@ -1,7 +1,6 @@
 """Find USB serial adapters without a driver.
 
-An adapter without a driver has no serial port, so only the list of USB devices shows it. Linux has
-this list in /sys; macOS and Windows have programs that print it.
+An adapter without a driver has no serial port, so it is found in the system's list of USB devices.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ class AdapterKind:
         product_ids: the USB ids of the products.
         module: the driver in the Linux kernel.
         website: the page with the drivers for Windows and macOS.
-        brltty: whether the program brltty mistakes such adapters for braille displays.
+        brltty: whether the program brltty mistakes the adapters for braille displays.
     """
 
     name: str
@@ -84,7 +83,7 @@ class UsbDevice:
 
     Attributes:
         vendor_id, product_id: its USB ids.
-        has_driver: whether it has a driver that makes a serial port.
+        has_driver: whether a driver makes a serial port for it.
     """
 
     vendor_id: int
@@ -105,7 +104,6 @@ class MissingDriver:
     """A description of the driver that an adapter needs.
 
     Attributes:
-        text: the adapter and its driver.
         fix: the command that loads or installs the driver; "" if there is none.
     """
 
