@@ -89,7 +89,7 @@ class Text:
         """Return the bytes of a text.
 
         Raises:
-            ValueError: for a value that is not accepted.
+            ValueError: for an invalid text.
         """
         if isinstance(value, str):
             data = value.encode(self.encoding)
@@ -180,7 +180,7 @@ class Count:
             )
 
     def at(self, index: int) -> int:
-        """Return the number of a command; the first command has the index 0."""
+        """Return the running number of the command with an index, which starts at 0."""
         return (self.first + index) % (1 << self.bits)
 
 
@@ -197,10 +197,9 @@ class Template:
     """A text in `Command.values` with names in braces, which are replaced by values.
 
     An example is ``Template("/cmd/start?handle={handle}&port={own_port}")``. A name is a value that
-    an earlier reply provided (`Command.provides`), or an argument that is declared with the path of
-    this field. `own_address` is this computer's address as seen by the sensor, and `own_port` is
-    the port at which this computer expects the data. Values consist of ASCII letters, digits and
-    ``_.~:+-``.
+    an earlier reply provided (`Command.provides`), or an argument of the command. `own_address` is
+    this computer's address as seen by the sensor, and `own_port` is the port at which this computer
+    expects the data. Values consist of ASCII letters, digits and ``_.~:+-``.
 
     Raises:
         SpecError: if the text is not ASCII, contains no names, or has an invalid name in braces.
@@ -267,7 +266,7 @@ class Template:
 
 
 def _format_value(value: Any) -> str:
-    """Return a value as text; a whole number without decimal places."""
+    """Return a value as text, without decimal places for a whole number."""
     if isinstance(value, float) and value.is_integer():
         return str(int(value))
     return str(value)

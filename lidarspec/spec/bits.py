@@ -100,7 +100,7 @@ Parse = Callable[[bytes], Mapping[tuple[str | int, ...], Any]]
 
 
 def probe(parse: Parse, size: int) -> list[BitField] | None:
-    """Return the bit fields of a block; None if its values are not made of its bits.
+    """Return the bit fields of a block; None if its values are not bit fields.
 
     Args:
         parse: a function that returns the values of a block; it must accept any bytes.
@@ -110,7 +110,7 @@ def probe(parse: Parse, size: int) -> list[BitField] | None:
     if any(not isinstance(value, int) or value != 0 for value in base.values()):
         return None
     full = parse(b"\xff" * size)
-    # The values in the block for digit k contain digit k of the binary index of each of their bits.
+    # The bits at one position of these values together are the index of a bit of the block.
     index_bits = (8 * size - 1).bit_length()
     patterns = [parse(_make_pattern(index_bit, size)) for index_bit in range(index_bits)]
     fields = list[BitField]()
@@ -131,7 +131,7 @@ def probe(parse: Parse, size: int) -> list[BitField] | None:
 
 @lru_cache(maxsize=64)
 def _make_pattern(index_bit: int, size: int) -> bytes:
-    """Return a block in which a bit is set if its index has the bit `index_bit` set."""
+    """Return a block in which each bit is digit `index_bit` of its own index."""
     pattern = sum(1 << index for index in range(8 * size) if index >> index_bit & 1)
     return pattern.to_bytes(size, "little")
 

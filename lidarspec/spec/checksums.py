@@ -169,8 +169,8 @@ class WordXor(Checksum):
 
     Args:
         head: the number of bytes at the start that form two-byte words.
-        groups: the sizes of the following words, 1 or 2 bytes each. This sequence of sizes is
-            repeated. A single byte at the end is a word.
+        groups: the sizes of the following words, 1 or 2 bytes each. The sequence of sizes is
+            repeated. A single byte at the end of the data is a word.
 
     Raises:
         ValueError: for invalid sizes.
@@ -325,7 +325,7 @@ def mirrored_bytes(register: int) -> int:
 
 @lru_cache(maxsize=256)
 def byte_table(width: int, poly: int, refin: bool) -> tuple[int, ...]:
-    """Return, for each value of a byte, how it changes the register of a CRC, (256,)."""
+    """Return the change of a CRC register for each value of a byte, (256,)."""
     table = list(range(256))
     feedback = reflect(poly, width)
     for _ in range(8):

@@ -325,7 +325,7 @@ class Command:
 
     @property
     def placeholders(self) -> frozenset[str]:
-        """The names in the templates of the command that are not arguments."""
+        """The names in the templates of the command, except its arguments."""
         names = {name for template in self.templates.values() for name in template.names}
         return frozenset(names - set(self.args))
 

@@ -301,8 +301,6 @@ class Checksummed(layer.SealedStruct):
         """Return the stored and the computed checksum of one parsed struct.
 
         Args:
-            data: the bytes of the struct.
-            obj: the parsed struct.
             base: the offset of the struct in the parsed stream.
         """
         return self._load_stored(obj), self._compute(data, obj, base)
@@ -311,8 +309,6 @@ class Checksummed(layer.SealedStruct):
         """Return the byte ranges (start, end) in the struct that the checksum covers.
 
         Args:
-            obj: one parsed struct.
-            size: the size of the struct in bytes.
             base: the offset of the struct in the parsed stream.
         """
         if self.over is not None:
@@ -393,9 +389,8 @@ class Parts(layer.Partition):
     the total size of the parts in bytes.
 
     Args:
-        kinds: the Struct of a part, or a dict of several Structs by name. The first Struct whose
-            constants match is used, so if the last Struct has no constants, it matches all other
-            parts.
+        kinds: the Struct of a part, or a dict of several Structs by name. The first Struct with
+            matching constants is used. A last Struct without constants matches all other parts.
         count: the number of parts.
         size: the size of the first part in bytes; 0 if there are no parts. Requires `following`.
         following: an expression of the fields of a part that gives the size of the next part in

@@ -503,8 +503,7 @@ def _check_names(
 class Configure:
     """The method ``sensor.configure(...)``, which returns a sensor with options.
 
-    Every sensor has the options in `OPTIONS`. The `configure` function of the plugin declares
-    further options.
+    Every sensor has the options in `OPTIONS`, and those of the plugin.
     """
 
     sensor: SensorDescription

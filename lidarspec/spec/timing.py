@@ -185,10 +185,8 @@ class Clock:
             fields of a date.
         wraps_at: the seconds after which the clock starts again at 0; None if it does not.
         pace: a function of `Fields` that returns the seconds from a packet to the next packet, or
-            nan if they are unknown; None if not declared. Without a counter, lost packets are found
-            by the pace. With a counter, the pace shows how often the counter has wrapped in a gap,
-            and whether a value of the counter is corrupt. The pace must then be correct in every
-            mode of the sensor. It is also used to distinguish related models.
+            nan if they are unknown; None if not declared. The pace must be correct in every mode of
+            the sensor, because it is used to find lost packets and to distinguish related models.
         reference: the source of the date, for a clock that starts again at 0. It is a pair: the
             name of another frame type that has the same clock, and a function of its `Fields` that
             returns the date in seconds since 1970, or nan if it is unknown. The first frame with a
@@ -233,13 +231,13 @@ class Clock:
             )
 
     def epoch_in(self, state: ClockState | None) -> str:
-        """Return the epoch of the clock in a state; None is an unknown state."""
+        """Return the epoch of the clock in a state, which is None if it is unknown."""
         if state is not None and state.epoch is not None:
             return state.epoch
         return self.epoch
 
     def epoch_at(self, time_ns: int, state: ClockState | None) -> str:
-        """Return the epoch of the clock in a given state, for a reading of `time_ns`."""
+        """Return the epoch of the clock at a time in ns, in a state."""
         epoch = self.epoch_in(state)
         if epoch == "hour" and time_ns >= FIRST_DATE_NS:
             return "utc"  # another frame has completed the hour

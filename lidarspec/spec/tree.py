@@ -1,10 +1,8 @@
 """The frame tree: a frame type as a tree of nodes in wire order.
 
-`lidarspec.spec.syntax` makes the tree from a plugin's struct, once for each frame type. Schemas,
-layouts, examples, wire tables, explanations and exports iterate over it (`children`, `nodes`) and
-do not use construct. Nodes are immutable. A node describes how bytes are stored, and its
-`FieldInfo` describes their value. The offset of a node is the sum of the sizes of the nodes before
-it.
+`lidarspec.spec.syntax` makes the tree from a plugin's struct. Schemas, layouts, wire tables and
+exports iterate over it (`children`, `nodes`) and do not use construct. A node describes how bytes
+are stored, and its `FieldInfo` describes their value.
 
     Struct          a sequence of members
     Sealed          a Struct with a checksum
@@ -23,17 +21,7 @@ it.
 
 Counts, lengths, conditions and keys are formulas, which consist of numbers, references to fields
 (`Ref`) and operations on both (`Op`). An expression that cannot be converted to a formula is
-`Untraced`. construct then reads the frames.
-
-The tree contains two nodes for each kind of part. The paths in `Kind.element` start at the top of
-the frame, as in the plugin's struct. `Kind.root` describes the part as a frame of its own, so its
-paths start at the part. Layouts and tables are made from `Kind.root`.
-
-If a field declares the size of a part (`FieldInfo.is_enforced`), its formula is the sum of the
-sizes of the nodes in this part (`size`). The size of padding is a formula as well. An array is
-identified by its axis (`Repeat.axis`, `FieldInfo.axes`). The path of a `Ref` to a single element of
-an array contains an index. A wire form, which decodes the bytes before they are parsed, belongs to
-the `Frame`, not to the tree.
+`Untraced`. Frames with such an expression are read by construct.
 """
 
 from __future__ import annotations
@@ -305,7 +293,7 @@ class Ref:
 class Op:
     """An operation on integers, as in Python.
 
-    ``//`` and ``%`` round down. Comparisons return 1 or 0.
+    Comparisons return 1 or 0.
 
     Attributes:
         symbol: one of + - * // % & | ^ << >> == != < <= > >= with two arguments, or - and not with
@@ -686,7 +674,7 @@ class Sealed:
         over: the paths of the first and the last member that the checksum covers; None for all
             bytes of the body without the bytes of `fields`.
         declared: the algorithm; None if a hook has to return it.
-        absent: the values that mean that the sensor has computed no checksum.
+        absent: the values of a frame without a checksum.
     """
 
     body: Struct | Sealed
@@ -764,8 +752,7 @@ class PartSequence:
         axis: the path of the array of parts.
         kinds: the kinds of parts, in the order in which they are tried.
         count: the number of parts; None if it is not declared.
-        size: the size of the first part in bytes, if each part declares the size of the next part;
-            else None.
+        size: the size of the first part in bytes; None if it is not declared.
         within: the total size of all parts in bytes; None if it is not declared.
         outer: the fields of the outer frame that formulas of the parts use.
         total: the field that later formulas use for the total size of all parts.

@@ -94,8 +94,7 @@ class AlongAxis(NDArrayOperatorsMixin):
         """Return the numbers with one axis for each name.
 
         Args:
-            names: for each axis of the result, the last name in the path of its array. The names
-                must include all arrays of `axes`.
+            names: for each axis of the result, the last name in the path of its array.
         """
         own = [name.rpartition(".")[2] for name in self.axes]
         ordered = self.array.transpose([own.index(name) for name in names if name in own])

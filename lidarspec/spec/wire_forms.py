@@ -117,7 +117,7 @@ class NumberRun:
 
     @cached_property
     def lowest(self) -> Values:
-        """The magnitude of the lowest value of each number; 0 if it is not signed, (n,)."""
+        """The magnitude of the lowest value of each number, (n,); 0 without a sign."""
         lowest = (self.largest >> np.uint64(1)) + np.uint64(1)
         return np.where(self.kinds == "i", lowest, np.uint64(0))
 
@@ -160,8 +160,6 @@ class Problem:
         reason: a description of the error; "" for a field that cannot be decoded.
         is_checksum: whether a checksum of the wire form is wrong.
         path: the path of the field with the error.
-        expected: the expected value.
-        got: the actual value.
     """
 
     offset: int
@@ -180,7 +178,7 @@ class Decoded:
         struct: the bytes of the struct.
         spans: for each run, the offsets of its fields in the encoded frame, and the sizes of the
             fields in the struct.
-        end: the offset in the encoded frame of the first byte after the last field.
+        end: the offset after the last field in the encoded frame.
         problem: the first error; None if the whole frame was decoded.
     """
 
@@ -191,7 +189,7 @@ class Decoded:
 
     @property
     def offsets(self) -> list[int]:
-        """For each byte of the struct, the offset of its field in the frame; then `end`."""
+        """The offset in the frame of the field of each byte; the last element is `end`."""
         starts = [begins.repeat(sizes) for begins, sizes in self.spans]
         return [*np.concatenate([np.zeros(0, np.intp), *starts]).tolist(), self.end]
 
@@ -318,8 +316,8 @@ def decode_runs(reader: RunReader, next_runs: NextRuns, size: int | None) -> Dec
     """Read the fields of a frame.
 
     Args:
-        size: the size of the frame with its end mark, which counts as one byte; None if the end is
-            missing.
+        size: the size of the frame, in which the end mark counts as one byte; None without an end
+            mark.
     """
     struct = b""
     spans = list[tuple[Offsets, Offsets]]()
@@ -771,8 +769,7 @@ class Echoes:
             is_whole: whether `characters` has all characters of the frame.
 
         Returns:
-            The characters with all echoes, and the offset of each. A missing echo has the offset of
-            the next character.
+            The characters with all echoes, and the offset of each character.
         """
         stride = self.size + len(self.mark)
         step_sizes = np.array([len(step) for step in self._find_steps(characters)], np.intp)
@@ -814,7 +811,7 @@ class Echoes:
         """Return the characters of steps as they are sent, with marks between echoes.
 
         Raises:
-            SpecError: if `characters` does not consist of whole steps.
+            SpecError: if the length of `characters` is not a multiple of a step.
         """
         room = self.most * self.size
         if len(characters) % room:
@@ -1076,11 +1073,11 @@ class Lines:
         return replace(decoded, problem=problem)
 
     def _strip(self, data: bytes) -> tuple[bytes, Offsets, Problem | None]:
-        """Remove newlines and check characters, and return the other characters.
+        """Remove newlines and check characters.
 
         Returns:
             The characters up to the first line with a wrong length, the offset of each character,
-            and the first error in the lines or None.
+            and the first error or None.
         """
         *lines, _ = data.split(b"\n")
         if lines and not lines[-1]:
