@@ -221,7 +221,7 @@ def require_feature(path: str | Path, feature: str) -> None:
 
 
 def _iter_organized(path: Path, scans: Iterable[Scan], *, is_single: bool) -> Iterator[Scan]:
-    """Yield scans, and check that they are organized.
+    """Yield scans, and raise an error if they are not organized.
 
     Args:
         is_single: whether only one scan is allowed.

@@ -137,10 +137,7 @@ def select_columns(
 
 
 def to_image(values: NDArray[Any], cloud: PointCloud) -> NDArray[Any]:
-    """Return values of organized points, (n,), as an image, (rows, columns).
-
-    The image has one row for each ring.
-    """
+    """Return values of organized points, (n,), as an image with a row for each ring."""
     columns, rows = cloud.shape or (len(cloud), 1)
     returns = len(cloud) // max(columns * rows, 1) or 1
     height = rows

@@ -84,7 +84,7 @@ def _format_bytes(values: NDArray[Any], *, is_text: bool) -> list[str]:
 
 
 def _format_objects(path: str, values: NDArray[Any]) -> Columns:
-    """Return a column of texts for each element of a field whose values are texts or objects."""
+    """Return a column of texts for each element of a field with texts or objects."""
     return {
         name: ["" if value is None else str(value) for value in column.tolist()]
         for name, column in _split_elements(path, values).items()
@@ -122,7 +122,7 @@ def holds_several_types(path: str | Path) -> bool:
 def _iter_tables(batches: Iterable[Batch]) -> Iterator[Columns]:
     """Yield the columns of the packets of each batch.
 
-    All tables have the columns of the first table; missing values are nan.
+    The tables have the columns of the first table; missing values are nan.
     """
     names: list[str] = []
     for packets in itertools.chain.from_iterable(batch.values() for batch in batches):

@@ -101,7 +101,7 @@ class RerunRecording:
             self.stream.save(f"/dev/fd/{self._copy.end}")
 
     def log_scan(self, scan: Scan, *, every_point: bool = False) -> None:
-        """Log a scan; before the first scan, log the facts about its sensor.
+        """Log a scan, and before the first scan the facts about its sensor.
 
         Raises:
             OSError: if the recording cannot be written.
