@@ -4,9 +4,8 @@ The argument of a function is ``f``, the `Fields` of a `Batch` of packets. Each 
 is a `Column`, which is an array with one axis for the packets and one axis for each level of arrays
 in the struct.
 
-Each axis has the name of its array. Therefore, arithmetic aligns columns by name, and fields of
-different arrays cannot be mixed by accident. A plain array has no names. It is aligned by its
-length, if exactly one array of the frame has this length.
+Each axis has the name of its array, so arithmetic aligns columns by name. A plain array is aligned
+by its length, if exactly one array of the frame has this length.
 """
 
 from __future__ import annotations
@@ -134,7 +133,7 @@ class Column(NDArrayOperatorsMixin):
 
     @property
     def seen(self) -> NDArray[Any]:
-        """All values; in a traced column, only the sample values."""
+        """The values; in a traced column, only the sample values."""
         return self.array
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -264,12 +263,12 @@ class Column(NDArrayOperatorsMixin):
         return AlongAxis((axis,), np.arange(_find_extent(self.batch.table, axis, most)))
 
     def gather(self, table: NDArray[np.float64]) -> Column:
-        """Return the row of a table for each value, which is the index of the row.
+        """Return the rows of a table that the values of the column select by index.
 
         The k numbers of a row become the elements along an array of the frame with k elements.
 
         Args:
-            table: (m + 1, k). The last row is nan; values outside of 0 to m - 1 select this row.
+            table: (m + 1, k). The last row is nan, and is selected by values outside of 0 to m - 1.
         """
         own = [place for place, name in enumerate(self.axes) if name is not None]
         depth = max(len(self.axes), self.batch.table.schema.depth())
@@ -489,7 +488,7 @@ def align(
 
 
 def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
-    """Cut the arrays to the shortest length along each axis, except length 1."""
+    """Cut the arrays to their shortest length along each axis; keep axes of length 1."""
     reversed_shapes = [array.shape[::-1] for array in arrays]
     shortest = [
         min((length for length in lengths if length != 1), default=1)
@@ -574,7 +573,7 @@ def _find_axis(
         shape: the lengths of the plain array.
         axes: the names of the axes of the columns.
         lengths: the lengths of the axes of the columns.
-        without: indices in `axes`. Arrays of the frame at these indices are ignored.
+        without: indices in `axes` at which arrays of the frame are ignored.
     """
     wanted = [(place, length) for place, length in enumerate(shape) if length != 1]
     there = {
@@ -633,7 +632,7 @@ def align_points(
 
     Raises:
         SpecError: if coordinates belong to different arrays of the frame or have different lengths,
-            or if only plain arrays vary along an array of the frame.
+            or if no value uses a field of an array along which the points vary.
     """
     anchor = Column(
         np.zeros((1,) * (1 + batch.table.schema.depth())),
@@ -912,7 +911,7 @@ def _list_paths(batch: Batch, frame: str) -> Iterable[str]:
 
 
 class _States:
-    """``f.state``: for each packet, the last frames of other types."""
+    """The fields of ``f.state``: for each packet, the last frame of each other type."""
 
     def __init__(self, batch: Batch) -> None:
         self._batch = batch

@@ -99,7 +99,7 @@ class Node:
 
     @cached_property
     def _operands(self) -> list[tuple[bool, Any]]:
-        """For each argument, whether it is a node, and the axes to add or the constant."""
+        """For each argument, whether it is a node, and its missing axes or the constant."""
         depth = max(len(arg.sample.axes) for arg in self.args if isinstance(arg, Node))
         return [
             (
@@ -354,9 +354,6 @@ def _fold_table_rows(
     function: Callable[..., Any], values: Sequence[Any], arrays: Sequence[Any]
 ) -> tuple[Node, NDArray[np.float64]] | None:
     """Apply a function to whole tables, before their rows are looked up.
-
-    Args:
-        arrays: the values after alignment.
 
     Returns:
         The node of the indices, and the new table. None if this is not possible.
