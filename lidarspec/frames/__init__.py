@@ -1,7 +1,6 @@
 """Frames and their bytes: field offsets, parsing and building.
 
-The modules use the tree of a frame type (`spec.tree`) to find the layout of its frames, to parse
-and build single frames, and to read tables of many frames. Modules in reading order:
+The input is the tree of a frame type (`spec.tree`). Modules in reading order:
 
 * `schema`: the fields of a frame type as a table, without bytes.
 * `compilability`: finds structs that cannot have layouts.

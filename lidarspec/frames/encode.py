@@ -509,7 +509,7 @@ def fill_counts(given: Container, table: Schema) -> None:
 def remove_computed_count(
     formula: Formula | None, given: Container, fields: Mapping[str, FieldInfo]
 ) -> None:
-    """Remove the count field of a formula from `given` if it is always computed."""
+    """Remove a formula's count field from `given` if the field is always computed."""
     path = None if formula is None else find_count_field(formula, fields)
     if path is not None and fields[path].is_enforced:
         holder, name = _find_holder(given, path)

@@ -94,7 +94,7 @@ class LayoutRows:
 
 
 class CompiledTable:
-    """A `Table` of frames with compiled layouts."""
+    """A `Table` of frames with layouts."""
 
     def __init__(self, schema: Schema, groups: Sequence[LayoutRows]) -> None:
         self.schema = schema
@@ -202,10 +202,7 @@ class CompiledTable:
         return column
 
     def _find_present_elements(self, axis: str, path: str) -> NDArray[np.bool_]:
-        """Return where a field exists in an array with elements of different sizes.
-
-        The shape is (n,), or (n, *lengths) if some elements of a frame lack the field.
-        """
+        """Return whether frames or array elements have a field, (n,) or (n, *lengths)."""
         base, indices = without_indices(path)
         if indices:
             return _has_element(self, base, indices)
@@ -394,11 +391,7 @@ class _PartRows:
 def _group_by_layout(
     pieces: Sequence[_PartRows], ranks: Sequence[NDArray[np.intp]]
 ) -> list[LayoutRows]:
-    """Group parts by layout.
-
-    Args:
-        ranks: for each piece, the indices of its parts in the table of all parts.
-    """
+    """Group parts by layout, given the index of each part in the table of all parts."""
     members: dict[int, dict[int, list[tuple[_PartRows, NDArray[np.intp]]]]] = {}
     for piece, own in zip(pieces, ranks, strict=True):
         members.setdefault(id(piece.layout), {}).setdefault(id(piece.buffer), []).append(
@@ -411,11 +404,7 @@ def _group_by_layout(
 
 
 def _gather_parts(parts: Sequence[tuple[_PartRows, NDArray[np.intp]]]) -> LayoutRows:
-    """Return parts in stream order as `LayoutRows`.
-
-    Args:
-        parts: pairs of parts and the indices of these parts in the table.
-    """
+    """Return parts in stream order as `LayoutRows`."""
     where = np.concatenate([own for _, own in parts])
     offsets = np.concatenate([piece.offsets for piece, _ in parts])
     first, _ = parts[0]

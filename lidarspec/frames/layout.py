@@ -149,8 +149,7 @@ class Leaf:
         The field must not be in an array.
 
         Args:
-            stops: the offset after the last byte of each candidate; by default the end of the
-                buffer.
+            stops: the end offset of each candidate; by default the end of the buffer.
 
         Returns:
             The indices of the candidates that have the field (None if all have it), and the values.
@@ -166,7 +165,7 @@ class Leaf:
         return which, self._from_start.load(gather_rows(buffer, starts, self.size))
 
     def read_first(self, frame: bytes | memoryview) -> int | None:
-        """Return the value of the field; None if the frame is cut off before its end."""
+        """Return the value of the field; None if the bytes end in or before the field."""
         if self.offset + self.size <= len(frame):
             return self.read_scalar(frame)
         return None

@@ -74,8 +74,7 @@ def find_layout(
     Args:
         values: the raw values of the fields that the layout depends on, by path.
         limit: the maximum size of a frame, in bytes.
-        given: for parts, the raw values of fields of the outer frame, by their path in the outer
-            frame.
+        given: for parts, the raw values of fields of the outer frame, by path.
 
     Raises:
         UnknownSelectorError: if the layout depends on a field that is not in `values`.
@@ -457,11 +456,7 @@ class HeaderWalk:
         self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent, self.cursor))
 
     def _find_size_bits(self) -> dict[int, tuple[int, int]]:
-        """Return the bits of the fields that contain the sizes of parts.
-
-        Returns:
-            A mask and the value of the masked bits, by byte offset.
-        """
+        """Return (mask, value) of the fields that contain the sizes of parts, by offset."""
         rows = np.zeros((2, self.cursor), np.uint8)
         held_leaves = [leaf for leaf in self.leaves.values() if leaf.info.is_enforced]
         for leaf in held_leaves:
@@ -714,8 +709,7 @@ class _CandidateSet:
     """The candidates in a buffer that are passed to `HeaderTree.classify`.
 
     Attributes:
-        refuted: the indices of candidates that are incomplete or too long, and have a wrong
-            constant.
+        refuted: the indices of incomplete or too long candidates with a wrong constant.
     """
 
     def __init__(
@@ -820,7 +814,7 @@ class HeaderTree:
         Candidates with an incomplete header are left out.
 
         Args:
-            stops: the offset after the last byte of each candidate; None if more bytes may follow.
+            stops: the end offset of each candidate; None if more bytes may follow.
 
         Returns:
             Pairs of a layout or refusal and the indices of its candidates.

@@ -56,8 +56,7 @@ class MeasuredSize(ABC):
         """Find the size in the candidates at these offsets.
 
         Args:
-            stops: the offset after the last byte of each candidate; by default the end of the
-                buffer.
+            stops: the end offset of each candidate; by default the end of the buffer.
 
         Returns:
             The indices of the candidates in which the size was found (None for all candidates), and

@@ -239,11 +239,7 @@ def _to_wire_error(
 
 
 def _parse_unverified(sensor: SensorDescription, name: str, data: bytes) -> Any:
-    """Return the values of a frame without verifying it.
-
-    Raises:
-        WireError: if a value cannot be read.
-    """
+    """Return the values of a frame without verifying it."""
     frame = sensor.frames[name]
     if isinstance(frame_layouts(frame), NotCompilableError):
         try:

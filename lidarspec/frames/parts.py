@@ -56,8 +56,7 @@ class LayoutLookup(Protocol):
         Candidates with an incomplete header are left out.
 
         Args:
-            stops: the offset after the last byte of each candidate; by default the end of the
-                buffer.
+            stops: the end offset of each candidate; by default the end of the buffer.
         """
 
     def layout_for(self, read: Callable[[Leaf | MeasuredSize], int]) -> Layout:
@@ -190,7 +189,7 @@ class Region:
         """Find the parts of the frames at these offsets.
 
         Args:
-            stops: the offset after the last byte of each frame; by default the end of the buffer.
+            stops: the end offset of each frame; by default the end of the buffer.
         """
         return _PartWalk(self, buffer, offsets + self.start, stops).run()
 
@@ -226,7 +225,7 @@ class _PartWalk:
 
     Args:
         starts: the offset of the first part of each frame.
-        stops: the offset after the last byte of each frame; by default the end of the buffer.
+        stops: the end offset of each frame; by default the end of the buffer.
     """
 
     def __init__(
@@ -437,7 +436,7 @@ def match_constants_at(
     In a truncated candidate, only the available bytes are compared.
 
     Args:
-        stops: the offset after the last byte of each candidate; by default the end of the buffer.
+        stops: the end offset of each candidate; by default the end of the buffer.
     """
     matches: NDArray[np.bool_] | None = None
     for word in constants:

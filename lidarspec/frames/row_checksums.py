@@ -146,11 +146,7 @@ def _compute_word_xor(algorithm: WordXor, rows: NDArray[np.uint8], spans: Spans)
 def _group_word_masks(
     algorithm: WordXor, number: int
 ) -> list[tuple[list[int], tuple[np.uint64, np.uint64]]]:
-    """Return masks that select the low and the high bytes in each word of a row.
-
-    Returns:
-        Pairs of the indices of some words, and the two masks of these words (low, high).
-    """
+    """Return masks that select the low and the high bytes in each word of a row."""
     masks = np.zeros((2, 8 * number), np.uint8)
     for mask, half in zip(masks, algorithm.halves, strict=True):
         for part in half:
@@ -477,7 +473,7 @@ def _compute_wide(
 
 @lru_cache(maxsize=1024)
 def _make_advance_table(distance: int, width: int, poly: int, refin: bool) -> bytes:
-    """Return the table of 256 bytes that advances a byte by `distance` bytes."""
+    """Return the effect of each byte value on the register `distance` bytes later."""
     if distance == 1:
         return bytes(byte_table(width, poly, refin))
     half = _make_advance_table(distance // 2, width, poly, refin)

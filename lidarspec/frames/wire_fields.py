@@ -27,9 +27,8 @@ class WireField:
 
     Attributes:
         path: the path with indices, such as "points[1].intensity".
-        block: the path of the bit block that contains the field, with indices; the path of the
-            field if it is not in a bit block.
-        info: the description of the field. For a constant without a name, its path is empty.
+        block: the path of the bit block that contains the field; else the path of the field.
+        info: the description of the field; its path is empty for a constant without a name.
         start: the offset of the first byte of the field, or of its bit block.
         end: the offset after the last byte of the field, or of its bit block.
         bits: the bits of the field in the block; None if the field is not in a bit block.
@@ -189,8 +188,7 @@ def examine(
 
     Args:
         limit: the maximum size of a frame, in bytes.
-        given: for a part, the values of fields of the outer frame, by their path in the outer
-            frame.
+        given: for a part, the values of fields of the outer frame, by path.
         start: for a part, its offset in the frame.
         prefix: for a part, its path in the frame.
         is_bounded: for a part, whether the frame has bytes after its parts.

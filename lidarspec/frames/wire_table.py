@@ -137,12 +137,7 @@ def extent(node: tree.Node, shown: str = "") -> SizeFormula:
 
 
 def _format_length(size: tree.Formula | None, shown: str) -> SizeFormula:
-    """Return a size as `SizeFormula`.
-
-    Args:
-        size: the declared size; None if it is unknown.
-        shown: the path of the part. An unknown size is written as "size(PATH)".
-    """
+    """Return a size as `SizeFormula`; an unknown size becomes "size(PATH)"."""
     if isinstance(size, int):
         return SizeFormula(size)
     return SizeFormula(0, (f"size({shown})" if size is None else format_formula(size),))
