@@ -1,7 +1,6 @@
 """Find the frames in a byte stream or in datagrams.
 
-The frames are returned as `Frames`, which has an array for each property of the frames. All other
-bytes are counted and raise no exception. These modules use no clock, port or thread. Modules in
+The frames are returned as `Frames`. All other bytes are counted, and raise no exception. Modules in
 reading order:
 
 * `results`: `Frames`, many frames as arrays; `Found`, one frame; `Counters`.

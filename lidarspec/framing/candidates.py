@@ -169,8 +169,7 @@ class Framing:
         Args:
             kind: the index of the type.
             offsets: offsets at which the constants of the type match.
-            stops: the offset at which the bytes of each candidate end; by default the end of the
-                buffer.
+            stops: the end offset of each candidate; by default the end of the buffer.
             gathered: whether to copy the bytes of candidates to `Frames.rows`.
 
         Returns:

@@ -54,8 +54,7 @@ class _DatagramBatch:
     """Checks a batch of datagrams, once for each set of active types.
 
     Args:
-        regular_frames: the datagrams as frames of one type and layout; None if this is not
-            possible.
+        regular_frames: the datagrams as frames of one type and layout, if possible.
     """
 
     def __init__(
@@ -118,11 +117,7 @@ class _DatagramBatch:
         return frames
 
     def _check(self, starts: Indices, sizes: Indices, mode: SearchState) -> tuple[Frames, Status]:
-        """Find the type and the layout of each datagram.
-
-        Returns:
-            The datagrams as frames, and the reason for each invalid datagram.
-        """
+        """Find the type and the layout of each datagram."""
         number = len(starts)
         common_size = broadcast_value(sizes)
         if common_size is not None:

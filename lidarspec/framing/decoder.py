@@ -409,15 +409,7 @@ class Decoder:
     def _count_skipped(
         self, buffer: NDArray[np.uint8], sizes: NDArray[np.int64], stops: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Count the bytes of skipped ranges.
-
-        Args:
-            sizes: the size of each skipped range in bytes.
-            stops: the offset after each skipped range.
-
-        Returns:
-            The number of bytes without fillers in each skipped range, (n,).
-        """
+        """Count the bytes of skipped ranges, (n,), without fillers."""
         self.stats.bytes_skipped += int(sizes.sum())
         for index in np.flatnonzero(sizes).tolist() if self._fillers else ():
             skipped = buffer[stops[index] - sizes[index] : stops[index]]

@@ -105,7 +105,7 @@ def draw_row(
     Args:
         frame: the name of a frame type with layouts and without parts.
         drawn: functions that draw the raw values of certain fields, by path.
-        tries: the maximum number of random frames to try.
+        tries: the maximum number of attempts.
 
     Raises:
         SpecError: if none of the frames is plausible.

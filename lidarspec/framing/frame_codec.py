@@ -54,7 +54,7 @@ class Codec:
 
         Args:
             offsets: the offsets, at which the prefix has to match.
-            stops: the end offset of the bytes of each candidate; None if more bytes may follow.
+            stops: the end offset of each candidate; None if more bytes may follow.
             gathered: whether to copy the bytes of candidates to `Frames.rows`.
         """
         raise NotImplementedError

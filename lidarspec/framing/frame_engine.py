@@ -298,11 +298,7 @@ def _check_incomplete(
     layout: Layout,
     sizes: NDArray[np.intp],
 ) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-    """Return the status of incomplete candidates, and how many bytes each requires.
-
-    Args:
-        sizes: the size of each candidate when it is complete, in bytes.
-    """
+    """Return the status of incomplete candidates, and how many bytes each requires."""
     status = np.full(len(offsets), SHORT, np.uint8)
     sizes = sizes.copy()
     for verdict, bits in ((LENGTH, layout.held), (CONSTANT, layout.constants)):

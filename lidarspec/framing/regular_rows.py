@@ -28,7 +28,7 @@ def find_regular_frames(
     """Return the frames at the start of a piece; None if the piece must be searched.
 
     Args:
-        buffer: the bytes that the last search left undecided, and the new bytes.
+        buffer: the undecided bytes of the last search, and the new bytes.
         mode: the state between pieces, which is updated.
         base: the offset of the buffer in the stream.
     """

@@ -38,7 +38,7 @@ def find_frames(
     """Find the frames in one piece of a stream.
 
     Args:
-        buffer: the bytes that the last search left undecided, and the new bytes.
+        buffer: the undecided bytes of the last search, and the new bytes.
         mode: the state between pieces, which is updated.
         base: the offset of the buffer in the stream.
         final: whether the stream ends with this piece, so that incomplete candidates are rejected.
@@ -80,7 +80,6 @@ class _FrameWalk:
     """Accepts the candidates of a piece while one set of frame types is active.
 
     Args:
-        live: the valid and incomplete candidates.
         base: the offset of the piece in the stream.
     """
 

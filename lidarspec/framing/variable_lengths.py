@@ -252,7 +252,6 @@ def _have_valid_checksums(
     Args:
         seal: the checksum in the longest layout.
         rows: the candidates, in rows of the size of the longest layout.
-        sizes: the sizes of the candidates, (n,).
     """
     # The bytes after the covered bytes, such as the stored checksum, move to the end of the row.
     # Zeros fill the gap. They do not change the result of the algorithms in `ZERO_EXTENDED`.
