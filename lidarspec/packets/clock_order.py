@@ -210,7 +210,7 @@ class ClockOrder:
         return MAX_PLACES_LATE + (0 if self._gaps is None else self._gaps.masked)
 
     def _leaps_back(self, time: int, passed: int, pace: float) -> bool:
-        """Return whether the clock is back at about its value before the last leap."""
+        """Return whether the clock has returned to its value before the last leap."""
         assert self._leap is not None
         reach = self._max_places_late * pace
         return abs(passed) > reach and 0 < time - self._leap[0] <= reach
