@@ -198,7 +198,7 @@ class Grids(NamedTuple):
 
 
 def slice_grid(grid: Grid, first: int, number: int) -> Grid:
-    """Return the organisation of a slice; an empty `Grid` for parts of columns.
+    """Return the organisation of a slice; an empty `Grid` if a column is cut.
 
     Args:
         grid: the organisation of all points.

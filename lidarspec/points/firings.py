@@ -72,8 +72,8 @@ def choose_returns(
 
     Args:
         which: "first", "last" or "strongest". The strongest return has the highest intensity.
-        names: the names of the returns, by return index (`Sensor.returns`); a return with the name
-            `which` is chosen.
+        names: the names of the returns, by return index (`Sensor.returns`). If a return has the
+            name `which`, this return is chosen.
 
     Raises:
         UsageError: for "strongest" if there is neither an intensity nor a return of this name.
