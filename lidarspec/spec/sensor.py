@@ -241,7 +241,7 @@ class SensorDescription:
         """Return the path of the parts of a frame that have a `points` or `imu` function.
 
         Returns:
-            The path; "" if the frame itself has the function, or if the frame type is unknown.
+            The path; "" if the frame has no such parts.
         """
         if frame not in self.frames:
             return ""

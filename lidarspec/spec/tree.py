@@ -56,17 +56,13 @@ def to_exact(number: float | int) -> Fraction:
 class Adapter:
     """Functions that convert between the raw values of a field and decoded values.
 
-    Parsed frames have the decoded values.
-
     Attributes:
-
         encode: a function of a value and the size of the field in bytes.
         dtype: the dtype of a column; uint8 if columns have the raw bytes.
         allowed: the raw values that can be decoded; None if there is no list.
         is_partial: whether a frame can be invalid because a raw value cannot be decoded.
         form: a text that describes how the value is stored; "" for a plain number.
-        decode_bytes: a function that decodes an array of bytes along the last axis; None if columns
-            do not have decoded bytes.
+        decode_bytes: a function that decodes an array of bytes along the last axis, or None.
     """
 
     decode: Callable[[Any], Any]
@@ -415,8 +411,7 @@ def write(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str
 
     Args:
         named: a function that returns the text of a field.
-        operations: a text with "{}" for each argument, by Python's symbol, for each operation that
-            the language writes in its own way.
+        operations: the texts of operations that differ from Python, such as "({} / {})" for "//".
 
     Raises:
         ValueError: if a part of the formula is `Untraced`.
@@ -439,7 +434,7 @@ def write(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str
 
 
 def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
-    """Return a field in one element of arrays; None if it is outside of an array.
+    """Return a field in one element of arrays, or None if an array lacks the field.
 
     Args:
         info: the field in all elements.
@@ -756,7 +751,7 @@ class PartSequence:
         within: the total size of all parts in bytes; None if it is not declared.
         outer: the fields of the outer frame that formulas of the parts use.
         total: the field that later formulas use for the total size of all parts.
-        is_array: whether the parts are the elements of an array that differ in size.
+        is_array: whether the parts are elements of an array, with different sizes.
     """
 
     name: str

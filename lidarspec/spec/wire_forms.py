@@ -69,10 +69,10 @@ class NumberRun:
     """Consecutive numbers of a struct.
 
     Attributes:
-        sizes: the size of each number in the struct in bytes, (n,).
+        sizes: the size of each number in bytes, (n,).
         kinds: "u", "i" or "f" for each number, as in `numpy.dtype.kind`, (n,).
         is_little: whether each number is little-endian, (n,).
-        paths: the path of the field of each number, n items.
+        paths: the path of the field of each number.
     """
 
     sizes: Offsets
@@ -216,7 +216,7 @@ class WireForm(Protocol):
     def begins(self, texts: Sequence[Characters]) -> Characters:
         """Return the first bytes of every encoded frame; None for a byte that varies.
 
-        The result ends before the first byte without a fixed offset. By default, it is empty.
+        By default, the result is empty.
 
         Args:
             texts: the bytes of the first fields of the struct; None for each byte that varies.
@@ -602,7 +602,6 @@ class _TokenReader:
     """Reads the tokens of one frame.
 
     Args:
-        data: the frame, up to the end of the last token.
         stop: the offset of the end of the last token; None if it is missing.
     """
 
@@ -762,7 +761,6 @@ class Echoes:
         """Insert the echoes that were not sent.
 
         Args:
-            characters: the characters of the steps.
             offsets: the offsets of the characters in the frame, (n,).
             end: the offset after the last character.
             zero: the character that is repeated for a missing echo.
@@ -888,7 +886,6 @@ class _SixBitReader:
 
     Args:
         offsets: the offsets of the characters in the frame, (n,).
-        end: the offset after the last character.
     """
 
     def __init__(self, form: SixBits, characters: bytes, offsets: Offsets, end: int) -> None:
