@@ -72,7 +72,7 @@ BUILT_IN = {format.suffix: format for format in (*ARRAYS, *TABLES, *CLOUDS, *BAG
 def formats() -> dict[str, Format]:
     """Return every format by suffix, including the formats of plugins.
 
-    If a plugin has a format with the suffix of a built-in format, the built-in format is returned.
+    A built-in format takes precedence over a plugin's format with the same suffix.
 
     Raises:
         SpecError: if a plugin's hook fails.

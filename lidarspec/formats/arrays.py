@@ -51,8 +51,8 @@ def write_array(
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False) -> None:
     """Write an .npz file with an array for each column, and arrays about the scans.
 
-    A column is written if all scans have it. With `organized`, the file has a single scan, and its
-    arrays have the shape (rows, columns).
+    A column is written if all scans have it. With `organized`, arrays have the shape (rows,
+    columns).
     """
     height: int | None = None
     with contextlib.ExitStack() as files:

@@ -1,9 +1,7 @@
 """Write frames of any type, one row per frame, with their fields in units.
 
 A row has the time of the frame, `time_ns`, and each field that is not constant. Each element of an
-array of numbers is a column, for example `gains[2]`.
-
-Parts of a frame have rows of their own. Their type is, for example, "report.tags.temperature".
+array of numbers is a column, for example `gains[2]`. Parts of a frame have rows of their own.
 
 A table contains one frame type. An MCAP file has a topic for each type, with JSON messages.
 """

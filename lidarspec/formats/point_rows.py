@@ -28,14 +28,12 @@ WRITE_BYTES = 1 << 20
 class PointRows:
     """Yields the points of each scan as rows of a structured array, (n,).
 
-    If a scan lacks a column of the first scan, its values are 0.
-
     Args:
         layout: a function that returns the type of a row, given the types of the first scan's
             columns by name.
         every_point: whether to include points without a valid return.
-        is_image: whether to order the points of an organized scan row by row. It has no effect if
-            there are several scans, or if `every_point` is False.
+        is_image: whether to order the points of a single organized scan row by row; requires
+            `every_point`.
 
     Attributes:
         dtype: the type of a row.

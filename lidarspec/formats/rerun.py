@@ -221,14 +221,11 @@ class RerunRecording:
 class _PipeCopy(threading.Thread):
     """Copies the output of the Rerun SDK from a pipe to a file.
 
-    The SDK does not write the file itself, because it may wait forever if the disk is full.
+    The SDK may wait forever if it writes the file itself and the disk is full.
 
     Attributes:
         end: the file descriptor to which the SDK writes.
         failure: the error that ended the writing of the file, or None.
-
-    Raises:
-        OSError: if the file cannot be opened.
     """
 
     def __init__(self, path: str | Path) -> None:
