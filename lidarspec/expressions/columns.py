@@ -79,7 +79,7 @@ class Batch:
         return len(self.table)
 
     def carry_over(self, ready: int) -> Carry:
-        """Return values that the next batch needs, if it starts with packet `ready`."""
+        """Return the values that the next batch, which starts at packet `ready`, needs."""
         return {slot: rest(ready) for slot, rest in enumerate(self.left)}
 
     def of(self, group: LayoutRows) -> Batch:
@@ -536,7 +536,6 @@ def _reshape_to_axes(
 
     Args:
         axes: the names of the axes, which are changed in place.
-        lengths: the lengths of the axes.
 
     Raises:
         SpecError: if the length of the array fits several arrays of the frame, or none.
@@ -573,7 +572,7 @@ def _find_axis(
         shape: the lengths of the plain array.
         axes: the names of the axes of the columns.
         lengths: the lengths of the axes of the columns.
-        without: indices in `axes` at which arrays of the frame are ignored.
+        without: indices in `axes` that are not compared with arrays of the frame.
     """
     wanted = [(place, length) for place, length in enumerate(shape) if length != 1]
     there = {
@@ -788,10 +787,10 @@ def field_column(
 def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False) -> NDArray[Any]:
     """Return a field in its unit, (n, ...), with one axis for each array level.
 
-    The result has at least `depth` axes after the first; axes of arrays that do not contain the
-    field have length 1.
+    Axes of arrays that do not contain the field have length 1.
 
     Args:
+        depth: the minimum number of axes after the first.
         raw: whether to return the integers of the frames, in the dtype of the field.
     """
     if raw:
@@ -845,8 +844,7 @@ class Fields:
     """The fields of a batch of packets as attributes, which are columns.
 
     ``f.points.distance`` is a field, and ``f.state.difop.vertical`` is a field of another frame
-    type. If the packets are parts, ``f.frame.counter`` is a field of the frame that contains the
-    part.
+    type. In parts, ``f.frame.counter`` is a field of the frame that contains the part.
 
     Args:
         prefix: the names of the enclosing structs, each followed by a dot.

@@ -2,11 +2,11 @@
 
 `trace` calls a `points`, `plausible` or clock function, and returns its result and the `Trace` of
 its steps. A step is a `Node`: a field, a state column, an elementwise call, or a step that depends
-on the order of packets. Some steps cannot be recorded, for example a branch that depends on data.
-They raise `UntraceableError`.
+on the order of packets. A step that cannot be recorded, such as a branch that depends on data,
+raises `UntraceableError`.
 
 `traverse` iterates over the nodes of a graph, and `compute` evaluates it for given values of the
-fields. The compilers of points (`points.numpy_plan`, `points.numba_kernels`) translate a graph.
+fields.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Node:
     def fields(self) -> tuple[Node, ...] | None:
         """The fields that the node is computed from, each once.
 
-        None if the computation has steps that are not elementwise calls.
+        None if a step of the computation is not an elementwise call.
         """
         if self.kind == "field":
             return (self,)
@@ -131,7 +131,7 @@ class Trace:
     Attributes:
         nodes: the nodes in the order in which they were made.
         steps: for each call of `Column.steps`, the node and the length of the result. The trace is
-            valid for packets for which all results have the same lengths.
+            valid only for packets with these lengths.
     """
 
     nodes: list[Node] = field(default_factory=list)
@@ -672,7 +672,7 @@ def find_choice(node: Node, width: int) -> tuple[Node, Any, Any] | None:
     """Return the condition and the two options of a simple ``np.where``, or None.
 
     The condition has one value for each packet or block. Each option is a number, or an expression
-    of one field with a value for each point.
+    of one field.
     """
     if node.kind != "call" or node.function is not np.where or len(node.args) != 3:
         return None
