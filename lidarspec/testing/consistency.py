@@ -101,10 +101,8 @@ def _find_beyond_limits(info: FieldInfo, value: Any) -> float | None:
 
 
 def _find_raw_limits(info: FieldInfo) -> tuple[int, int]:
-    """Return the lowest and highest raw value that a sweep may return for a field.
-
-    A field that represents exactly one turn may wrap: 360 degrees are sent as 0.
-    """
+    """Return the lowest and highest raw value that a sweep may return for a field."""
+    # A field that represents exactly one turn may wrap: 360 degrees are sent as 0.
     raw_turn = 1 << info.bits
     full_turn = FULL_TURNS.get(info.unit)
     if full_turn is not None and np.isclose(raw_turn * abs(info.scale), full_turn):

@@ -484,7 +484,7 @@ def _check_strength(
 
 
 def _find_max_weak_bits(sensor: Sensor, frame: Frame) -> int:
-    """Return the number of constant and checksum bits up to which a frame is weak."""
+    """Return the largest number of constant and checksum bits of a weak frame."""
     if sensor.datagrams:
         return WEAK_BITS_IN_DATAGRAMS
     if frame.data:

@@ -207,7 +207,7 @@ def is_cut(before: Any, after: Any) -> bool:
 
 
 def the_start_of_a_frame_may_be_content(subject: SensorUnderTest, name: str) -> None:
-    """Check that a wire form of bytes can send the first bytes of a frame in its fields."""
+    """Check that fields may contain the bytes that begin a frame."""
     frame = subject.sensor.frames[name]
     coder = frame_coder(frame)
     if not isinstance(coder, FormCoder) or coder.form.is_text or not coder.begins:

@@ -157,7 +157,7 @@ def _trace_points(subject: SensorUnderTest, name: str) -> Any:
 
 
 def find_fields(*values: Any, looked_up: bool = True) -> list[Node]:
-    """Return the nodes of the fields that traced values are calculated from.
+    """Return the field nodes from which traced values are calculated.
 
     Args:
         looked_up: whether to include fields that are only used as indices of a table.

@@ -195,7 +195,7 @@ class SensorUnderTest:
 
     @property
     def frames(self) -> dict[str, Frame]:
-        """The frame types to test, without types that a tested related model has as well."""
+        """The frame types to test; types shared with a tested related model are omitted."""
         tested = {id(frame) for sensor in self.tested for frame in sensor.frames.values()}
         return {
             name: frame for name, frame in self.sensor.frames.items() if id(frame) not in tested
@@ -203,7 +203,7 @@ class SensorUnderTest:
 
     @property
     def commands(self) -> list[str]:
-        """The commands to test, without commands that a tested related model has as well."""
+        """The commands to test; commands shared with a tested related model are omitted."""
         return [
             name
             for name in self.sensor.commands

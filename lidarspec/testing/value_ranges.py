@@ -71,7 +71,7 @@ class LayoutRanges:
         ]
 
     def make_struct(self, values: Mapping[str, Values], fixed: Container[str]) -> bytes | None:
-        """Return a valid struct with these values, or None; invalid values are replaced.
+        """Return a struct with these values, invalid values replaced; None if impossible.
 
         Args:
             fixed: the paths of the fields whose values must not be replaced.
@@ -225,7 +225,7 @@ class LayoutRanges:
 
 
 def _return_next(values: Iterator[Any], _: random.Random) -> Any:
-    """Return the next value, instead of a random one."""
+    """Return the next value, instead of a random value."""
     return next(values)
 
 
@@ -233,7 +233,7 @@ def find_ends(
     wanted: Mapping[str, tuple[int, int]],
     are_valid: Callable[[Sequence[tuple[str, int]]], Sequence[bool]],
 ) -> dict[str, int]:
-    """Return the valid value nearest to a wanted value for each field, by bisection.
+    """Return for each field the valid value nearest to a wanted value.
 
     Args:
         wanted: the path of each field -> (a valid value, the wanted value).
@@ -275,7 +275,7 @@ SINGLE_WALKS = 10
 def find_ranges(
     sensor: Sensor, frame: str, header: tuple[tuple[str, int], ...]
 ) -> LayoutRanges | None:
-    """Return the ranges of frames with this header; None if no valid frame is found.
+    """Return the ranges of frames with a header; None if no valid frame is found.
 
     Args:
         frame: a frame type that is compiled and has no parts.
