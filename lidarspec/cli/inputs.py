@@ -322,7 +322,7 @@ def _make_wrong_checksums_error(sample: SampleBytes) -> WireError | None:
 
 
 def no_scan_error(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
-    """Return the error for a source without a scan, which names the cause."""
+    """Return the error that says why a source has no scan."""
     sensor = device.sensor
     stats = device.stats
     if (failure := stats.failure(sensor.id)) is not None:

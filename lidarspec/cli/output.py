@@ -278,7 +278,7 @@ def _fit_widths(lines: Sequence[Sequence[str]], room: int) -> list[int]:
 
 
 def _fold_row(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator[str]:
-    """Yield the lines of one row, with cells without a width below the row."""
+    """Yield the lines of one row, and the lines of the cells that have no width."""
 
     def wrap(cell: str, width: int) -> list[str]:
         if len(cell) > width:
