@@ -171,7 +171,7 @@ class ClockTimeline:
         return not self.faults and not self.jump_ns
 
     def delay_power_on(self, delay_ns: int) -> None:
-        """Move the time of power-on, by the clock of the computer, to a later time."""
+        """Move the time of power-on to a later time."""
         self._power_on_ns += delay_ns
 
     def shift(self, readings: Times, times: Times, power_on_reading: int) -> Times:

@@ -253,7 +253,7 @@ class ClockWriter:
         self._fields = sorted(fields, key=lambda field: -field.step_ns)
 
     def _probe(self, table: CompiledTable, path: str, info: FieldInfo) -> tuple[int, int]:
-        """Return the two steps of the reading when a field is increased by 1 twice, ns."""
+        """Increase a field by 1 twice; return both changes of the reading, ns."""
         before = table.raw(path)
         start = 0  # a float cannot represent a date and a step of one raw value
         if info.kind == "int":

@@ -222,7 +222,7 @@ class ReplyMaker:
 def _match_command(
     command: Command, values: Mapping[str, Any], fields: Mapping[str, FieldInfo]
 ) -> dict[str, str] | None:
-    """Return the texts for the placeholders of a command, or None without a match."""
+    """Return the text for each placeholder of a command; None if the values differ."""
     fixed = {
         path: find_code(fields[path], value) if path in fields else value
         for path, value in command.fixed.items()
@@ -384,9 +384,8 @@ class SimulatedDevice:
             address is "" if the command contained only a port.
         sent: number of sent frames by type, before faults.
         lines: the links with their faults, by name.
-        utc_offset_ns: UTC minus the time that the caller passes, ns, for the date of a synchronized
-            clock; None to use the dates of the spec's `sweep`. A change takes effect at the next
-            `start`.
+        utc_offset_ns: UTC minus the time that the caller passes, ns; None if the sensor sends the
+            dates of the spec's `sweep`. A change takes effect at the next `start`.
 
     Raises:
         UsageError: if the sensor declares no `sweep`, or if its clock cannot have the faults.

@@ -110,8 +110,8 @@ class FrameMaker:
     def table(self, frames: Sequence[Values]) -> CompiledTable:
         """Return a table with one frame for each mapping of paths to physical values.
 
-        The value of an enum may be its name, and an array of bytes may be bytes. A part is a
-        mapping of field paths to values.
+        The value of an enum may be its name. The value of an array of bytes may be bytes. The value
+        of a part is a mapping of field paths to values.
 
         Raises:
             SpecError: if a value is given for a field that the frame does not have.

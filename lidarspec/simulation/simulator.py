@@ -545,7 +545,7 @@ def _evaluate_points(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[
 
 
 def _make_point_batch(sensor: Sensor, table: CompiledTable) -> Batch:
-    """Return a table as a batch whose state has no frames of other types."""
+    """Return a table as a batch that begins a stream."""
     state: dict[str, tuple[Table | None, NDArray[np.intp]]]
     state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
     if isinstance(table, PartRows):
@@ -1109,7 +1109,7 @@ def _find_main_clock(sensor: Sensor, others: FramesWithoutPoints) -> tuple[str, 
 
 
 def _find_scale(epoch: str) -> str:
-    """Return the time scale of an epoch of `Clock`; "" if it has none."""
+    """Return the time scale of a clock's epoch; "" if the epoch has none."""
     if epoch == "hour":
         return "utc"
     if epoch in DATED_EPOCHS:
@@ -1118,7 +1118,7 @@ def _find_scale(epoch: str) -> str:
 
 
 def make_opening_frame(sensor: Sensor) -> bytes:
-    """Return the frame that must precede the data frames; b"" if none must."""
+    """Return the frame that must precede the data frames, or b""."""
     after = sensor.frames[sensor.data_frame].after
     if after is None:
         return b""
