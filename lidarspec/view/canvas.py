@@ -153,7 +153,7 @@ class CellGrid:
         self.inks[row, column : column + len(text)] = ink
 
     def paste(self, row: int, column: int, other: CellGrid) -> None:
-        """Copy another picture into this one, without the parts that would lie outside.
+        """Copy the parts of another picture that fit into this picture.
 
         Args:
             row, column: the cell for the upper left corner of the other picture.
@@ -218,7 +218,7 @@ class Canvas:
         self.labels: dict[tuple[int, int], tuple[str, int]] = {}
 
     def plot(self, column: NDArray[Any], row: NDArray[Any], shade: NDArray[Any]) -> None:
-        """Set the dots of points, without points outside the canvas.
+        """Set the dots of the points that are on the canvas.
 
         Args:
             column, row: fractional coordinates in dots, (n,).
@@ -231,7 +231,7 @@ class Canvas:
         self.steps[down[order] // DOTS_DOWN, across[order] // DOTS_ACROSS] = steps[order]
 
     def draw_line(self, column: NDArray[Any], row: NDArray[Any]) -> None:
-        """Set the dots of a ring or an axis, which points cover.
+        """Set the dots of a ring or an axis.
 
         Args:
             column, row: fractional coordinates in dots, (n,).

@@ -44,8 +44,8 @@ class LiveScans:
             possible.
         speed: the speed of a played file, relative to the recorded speed.
         select: the scans to show; None for all.
-        ahead: about this many seconds of a played file are read at a time; None for the size that
-            is read fastest.
+        ahead: approximate number of seconds of a played file to read at a time; None to read as
+            fast as possible.
 
     Attributes:
         speed: the speed of a played file; it may be changed.

@@ -155,15 +155,13 @@ class RateTally:
         )
 
     def _speed(self) -> float | None:
-        """Return the scans per second; None if unknown.
-
-        Arrival times may be coarse, so a mean is more exact than a median.
-        """
+        """Return the scans per second; None if unknown."""
         if not self._periods:
             return None
         periods = np.array(self._periods)
         median = np.median(periods)
         is_usual = np.abs(periods - median) <= MAX_PERIOD_DEVIATION * median
+        # Arrival times may be coarse, so the mean is more exact than the median.
         return float(1 / periods[is_usual].mean())
 
     @property
@@ -219,7 +217,7 @@ class RateMeter:
         self._count_packets(count, arrivals, by_host=True)
 
     def _count_packets(self, count: int, times: NDArray[np.int64], *, by_host: bool) -> None:
-        """Count packets at times, which are ascending, (n,) ns."""
+        """Count packets by their times, (n,) ns, ascending."""
         previous = np.array([] if self._last_ns is None else [self._last_ns], np.int64)
         gaps = np.diff(np.concatenate([previous, times])) * 1e-9
         if len(times):

@@ -46,7 +46,7 @@ def write_title(window: CellGrid, sensor: str, source: str, state: str, ink: int
 
 
 def shorten_source(source: str, room: int) -> str:
-    """Return the source, or only its end if it is too long, or "" without space.
+    """Return the source; its end if it is too long; "" if there is no space.
 
     Args:
         room: number of characters that are available.
