@@ -81,7 +81,7 @@ def lidarspec_sensors() -> Iterable[Sensor]:  # type: ignore[empty-body]
 
 @hookspec(firstresult=True)
 def lidarspec_checksum(sensor: Sensor, frame: Frame) -> Checksum | None:
-    """Return the checksum algorithm of a frame type; None keeps the declared one."""
+    """Return the checksum of a frame type; None to keep the declared checksum."""
 
 
 @hookspec(firstresult=True)
@@ -257,7 +257,7 @@ class Registry:
 
     @property
     def plugins(self) -> list[Plugin]:
-        """All installed plugins, with an `error` if an id of the plugin is not available."""
+        """All installed plugins, including plugins that failed to load."""
         self._load_all()
         offered = [self._load_module(entries) for entries in self._offered.values()]
         return [self._drop_lost_names(plugin) for plugin in (*self._modules, *offered)]
@@ -361,7 +361,7 @@ class Registry:
                 self._claims.setdefault(name, {}).setdefault(home, claimed)
 
     def _find_owner(self, name: str) -> Home | None:
-        """Return the plugin that provides the sensor with a name, or None if undecided."""
+        """Return the plugin that provides the sensor with a name, or None."""
         claims = self._claims.get(name, {})
         homes = [home for home, claimed in claims.items() if claimed] or list(claims)
         first = {normalise_name(home[0]): home for home in reversed(homes)}
@@ -451,7 +451,7 @@ class Registry:
 
     @property
     def failures(self) -> list[Plugin]:
-        """The plugins with an error, without the plugins that were not loaded yet."""
+        """The plugins that have an error, among the plugins that were loaded so far."""
         offered = [
             self._load_module([entry for entry in entries if entry in self._tried])
             for entries in self._offered.values()

@@ -27,7 +27,7 @@ def path_while_written(path: Path) -> Path:
 
 
 def remove_abandoned(path: Path) -> None:
-    """Remove temporary files and folders of a path that killed processes have left."""
+    """Remove the temporary files that killed processes have left for a path."""
     for process, name in _list_unfinished(path.parent.absolute()):
         left = path.with_name(f".{process}.{name}")
         with contextlib.suppress(OSError, SourceError):
