@@ -7,10 +7,9 @@ A plugin imports only from this package and from `lidarspec`. It makes a `Sensor
 a manual. Modules in reading order:
 
 * `description`: `Frame`, `Command`, `Simulation`, `Relative`, `Reported`.
-* `sensor`: `SensorDescription`, which combines these values. `Sensor`, in
-  `lidarspec.sensor_operations`, is a description with methods that decode, build and so on.
+* `sensor`: `SensorDescription`, which combines these values.
 * `enum_values`: the values of enum fields, with their names.
-* `options`: finds the values that options of `configure` accept, from annotations.
+* `options`: the accepted values of options.
 * `arguments`: arguments of commands, and values that are filled in when a command is sent.
 * `fields`: members of a struct that add units, checksums and parts.
 * `checksums`: checksum algorithms as values.

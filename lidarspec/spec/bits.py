@@ -35,8 +35,6 @@ class BitField:
 
     Attributes:
         keys: the field names and array indices that lead to the value in the parsed block.
-        segments: the bits of the value.
-        width: the number of bits.
         signed: whether the top bit is a sign bit.
         flag: whether the value is parsed as False or True.
     """

@@ -133,7 +133,6 @@ class FieldInfo:
         dtype: the dtype of the raw value in native byte order; None if only construct can read it.
         kind: "int", "float", "bytes" or "other".
         scale, offset, unit: ``physical = raw * scale + offset``, in this unit.
-
         bits: the width in bits; 0 if the width is not fixed.
         const: the value that the field must have; None if any value is valid.
         allowed: the raw values that the field may have, in ascending order; None for any value.

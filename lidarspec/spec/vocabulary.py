@@ -278,8 +278,6 @@ def side_by_side(*arrays: Any) -> Any:
 def running(a: Array) -> Array:
     """Return the cumulative sum along the innermost array.
 
-    It is needed if a frame contains differences of values instead of values.
-
     Returns:
         float64, the shape of `a`.
     """
@@ -297,8 +295,8 @@ def take(table: Array, index: Array) -> Array:
         index: the indices.
 
     Returns:
-        float64, the shape of `index`. For a table of rows, the last axis of `index` has the length
-        1, and that of the result the length k: an index (n, 16, 1) gives a result (n, 16, k).
+        float64, the shape of `index`. For a table of rows, an index (n, 16, 1) gives a result (n,
+        16, k).
     """
     entries = np.asarray(table, np.float64)
     if entries.ndim == 1:

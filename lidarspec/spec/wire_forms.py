@@ -216,7 +216,7 @@ class WireForm(Protocol):
     def begins(self, texts: Sequence[Characters]) -> Characters:
         """Return the first bytes of every encoded frame; None for a byte that varies.
 
-        By default, the result is empty.
+        The result ends before the first byte without a fixed offset. By default, it is empty.
 
         Args:
             texts: the bytes of the first fields of the struct; None for each byte that varies.
@@ -276,6 +276,9 @@ class BulkEnds(Protocol):
 
     def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
         """Return the size of the frame at each offset, or `NO_END` or `NO_FRAME`, (n,).
+
+        The size of a valid frame is the same as that of `find_end`. An invalid frame may give
+        `NO_FRAME`.
 
         Args:
             buffer: the input.
