@@ -1,8 +1,7 @@
 """Write robotics logs: ROS messages in an MCAP file, ROS 1 bag or ROS 2 bag.
 
 The topic /points has each scan as sensor_msgs/PointCloud2. For planar sensors, /scan has each scan
-as sensor_msgs/LaserScan. On request, /packets has the raw packets with their arrival times, so that
-the log can be read again as a source.
+as sensor_msgs/LaserScan. On request, /packets has the raw packets.
 """
 
 from __future__ import annotations

@@ -47,8 +47,7 @@ class RerunRecording:
     data to a viewer.
 
     Args:
-        ramp: the column that the colours show: "range", "intensity" or an additional column. The
-            first scan determines the scale of the colours.
+        ramp: the column that the colours show: "range", "intensity" or an additional column.
 
     Raises:
         UsageError: if the Rerun SDK is not installed.
