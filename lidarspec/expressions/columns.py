@@ -295,8 +295,8 @@ class Column(NDArrayOperatorsMixin):
     def shift(self, step: int) -> Column:
         """Return for each element the value `step` elements later in stream order.
 
-        A negative step returns earlier values. The result has the same axes. A value is nan if
-        packets were lost between both elements, or if the other element does not exist.
+        A negative step returns earlier values. A value is nan if packets were lost between both
+        elements, or if the other element does not exist.
         """
         row = FlatColumn(self)
         size = abs(step)
@@ -427,8 +427,7 @@ def align(
     """Align columns and other arrays, so that they broadcast.
 
     Returns:
-        The arrays, the names of their common axes, and the smallest `ready` of the columns (see
-        `Column`).
+        The arrays, the names of their common axes, and the smallest `ready` of the columns.
 
     Raises:
         SpecError: if the values belong to different arrays of the frame.
@@ -626,8 +625,8 @@ def align_points(
     """Align the coordinates and other columns that `points` returns.
 
     Returns:
-        The arrays, the names of their axes, the smallest `ready` of the columns (see `Column`), and
-        the common shape of the arrays, (n, ...).
+        The arrays, the names of their axes, the smallest `ready` of the columns, and the common
+        shape of the arrays, (n, ...).
 
     Raises:
         SpecError: if coordinates belong to different arrays of the frame or have different lengths,

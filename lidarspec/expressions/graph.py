@@ -523,8 +523,6 @@ IntegerConverter = Callable[[Any, int], NDArray[np.int64]]
 class HeaderFunction:
     """Evaluates a function of header fields, and caches the terms of its result.
 
-    A term is computed again only if its fields have changed.
-
     Args:
         function: a function of `Fields` that returns a column, or several columns (the terms).
         to_integers: a function that converts the values of a term to integers.
