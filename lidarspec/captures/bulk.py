@@ -57,7 +57,8 @@ class RecordKind:
         source: address and port of the sender.
         value: the first bytes of a record, as 64-bit words.
         mask: the bits of `value` that are equal in all records of the kind.
-        trailer: the NumPy type of the last word of the record; None for records without this word.
+        trailer: the NumPy type of the length that is repeated at the end of a record; None if it is
+            not repeated.
     """
 
     length: int
@@ -155,8 +156,8 @@ def find_records(
     """Return the offsets of the complete records between `start` and `stop`.
 
     Returns:
-        The start of each record, followed by the end of the last record; and whether `form.read`
-        must read the next record.
+        (The start of each record, followed by the end of the last record; whether `form.read` must
+        read the next record).
     """
     pieces: list[Indices] = []
     single: list[int] = []
@@ -449,7 +450,7 @@ class _RecordBlock:
         matched: Indices,
         names: dict[Sender, int],
     ) -> NDArray[np.uint8]:
-        """Insert the datagrams that were read one at a time; return the new buffer."""
+        """Insert the separately read datagrams into the batch; return the new buffer."""
         data = b"".join(datagram.data for datagram in self._singles.values())
         at = len(buffer)
         rows = []

@@ -139,7 +139,7 @@ class IpPacket(NamedTuple):
             IPv6.
         body: the bytes after the IP header.
         body_offset: offset of `body` in the frame; 0 for a reassembled packet.
-        fragment: None for a whole packet.
+        fragment: the position of the fragment; None for a whole packet.
         variable_offsets: offsets of the bytes of the IP header that differ between packets.
     """
 

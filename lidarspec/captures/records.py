@@ -204,7 +204,7 @@ class PcapRecords:
     def length_field(self, length: int) -> tuple[int, str, int]:
         """Return (offset, NumPy type, value) of the two length fields of a record.
 
-        The two adjacent fields are read as one number. The packet must not be truncated.
+        The packet must not be truncated.
         """
         captured: int = length - self._head.size
         return 8, f"{self.order}u8", captured << 32 | captured
@@ -281,12 +281,7 @@ class PcapRecords:
         return None
 
     def _is_plausible(self, captured: int, original: int) -> bool:
-        """Return whether a packet is whole, or truncated at the snap length.
-
-        Args:
-            captured: the length of the packet in the file.
-            original: the length of the packet on the network.
-        """
+        """Return whether a packet is whole, or truncated at the snap length."""
         return 0 < captured <= MAX_PACKET_BYTES and captured in (original, self._snap_length)
 
     def _has_wrong_length(self, captured: int, original: int) -> bool:
@@ -346,7 +341,7 @@ class PcapngBlocks:
         return 4, f"{self.order}u4", length
 
     def find_layout(self, record: bytes) -> RecordLayout | None:
-        """Return the layout of a block; None if blocks of its type must be read singly."""
+        """Return the layout of a block; None if its packet must be read with `read`."""
         kind, _, number = struct.unpack_from(self.order + "III", record)
         if kind != ENHANCED_PACKET:
             return None

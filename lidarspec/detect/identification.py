@@ -96,7 +96,7 @@ def distinguish(candidates: Sequence[Sensor], frames: Mapping[str, Sequence[Foun
     """Decide which of several sensors with equal data frames sent the frames.
 
     Args:
-        frames: id -> frames that this sensor decoded, in the order of arrival.
+        frames: sensor id -> the frames that this sensor decoded, in the order of arrival.
     """
     ids = {sensor.id for sensor in candidates}
     excluding = {
@@ -149,7 +149,7 @@ def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
 
 
 def _find_excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
-    """Return related models whose packets differ from the sensor's packets.
+    """Return related models that must have sent the frames instead of the sensor.
 
     Returns:
         Id of the related model -> its difference from the sensor.
@@ -387,7 +387,7 @@ class Score:
         share: the share of the bytes that are in frames of the sensor.
         data_frames: number of decoded data frames.
         frames: all decoded frames.
-        evidence: evidence for this sensor, in addition to its frames; "" if there is none.
+        evidence: further evidence for this sensor; "" if there is none.
     """
 
     sensor: Sensor
@@ -808,7 +808,7 @@ def find_fitting_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Se
 def find_nearest_fault(data: bytes) -> WireError | None:
     """Return the error of the installed sensor that parsed most of an invalid frame.
 
-    Returns None if no sensor has a frame with such a beginning.
+    Returns None if no frame type begins like the data.
     """
     errors = []
     for sensor in sensors().values():

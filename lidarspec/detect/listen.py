@@ -154,7 +154,7 @@ def _read_sample(source: str, seconds: float, baud: int | None, name: str) -> It
 
 
 def _warn_of_other_senders(opened: LiveTransport) -> tuple[str, ...]:
-    """Return a tuple with a warning if only other senders sent datagrams; else empty."""
+    """Return warnings if only other senders have sent datagrams."""
     if opened.other_sender is None:
         return ()
     example = endpoint(opened.other_sender)

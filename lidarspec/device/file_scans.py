@@ -188,7 +188,6 @@ def _name_parts(
     Args:
         name: the attributes and keys that lead from the sensor to the value.
         names: name -> object; modified.
-        seen: the ids of all objects in `names`.
     """
     if isinstance(value, _PLAIN_TYPES) or id(value) in seen:
         return

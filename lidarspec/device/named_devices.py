@@ -10,8 +10,8 @@ A name can be used instead of a SOURCE; a file called front is written as ``./fr
 read: the file in the user's configuration directory, and the nearest file that the user owns in the
 working directory or above it (the project's file).
 
-A project may be untrusted. Its file cannot replace devices of the user's file. Unless the user has
-allowed its folder, it cannot run Python or refer to paths outside the folder. A mistake in a file
+A project may be untrusted. Its file cannot replace devices of the user's file. It can run Python or
+refer to paths outside the folder only if the user has allowed the folder. A mistake in a file
 disables only the devices of that file.
 """
 

@@ -124,7 +124,7 @@ class SenderFilter(SenderCheck):
 
     @property
     def warnings(self) -> list[str]:
-        """A list with a warning if another sender sends to the same port; else empty."""
+        """The warnings about another sender that sends to the same port."""
         if self.other_sender is None or self._owner is None:
             return []
         text = (
@@ -167,11 +167,7 @@ class SenderFilter(SenderCheck):
         return frames.select(np.array(mine, np.bool_))
 
     def _update_owner(self, sender: Sender, chunk: Chunk) -> bool:
-        """Select the sender of a chunk as the sensor if the chunk has suitable frames.
-
-        Returns:
-            Whether the sender replaces another sender.
-        """
+        """Select the sensor by the frames in a chunk; return True if it was replaced."""
         owner = self._owner
         if (
             self._is_sure

@@ -5,9 +5,9 @@ passes all times, in ns of one monotonic clock. Each link has at most one curren
 queue of further requests. Every frame that arrives on the link is compared with the expected reply.
 
 A late reply must not be taken for the reply to the next request. After a timeout, the session
-therefore expects the late reply for the same time again. During this time, it delays requests whose
-reply could not be distinguished from the late reply. Later, only the fields in `matches` or
-`echoes` distinguish the two replies.
+therefore waits for the late reply until twice the timeout has passed. Until then, it delays
+requests whose reply could not be distinguished from the late reply. After that, only the fields in
+`matches` or `echoes` distinguish the replies.
 
 A running number (`Count`) is set when a request is made, so repetitions of the command have the
 same number. A value from an earlier reply is set when the command is sent.
@@ -144,9 +144,10 @@ class ExpectedReply:
     """The frames that can be the reply to one request.
 
     Attributes:
-        tables: frame type of a possible reply -> path -> field.
-        matches: path -> value that the reply must have, if its frame type has this path.
-        echoes: path -> value that the reply or a refusal must have in addition, like `matches`.
+        tables: the fields of each possible reply: frame type -> path -> field.
+        matches: the values that a reply must have: path -> value. Paths that its frame type does
+            not have are ignored.
+        echoes: the values that both a reply and a refusal must have, like `matches`.
         refusal: the frame type of a refusal; None if the sensor sends no refusals.
     """
 

@@ -194,7 +194,7 @@ class SourceRecording:
     def run(self) -> Generator[str, None, None]:
         """Record until the end or a limit; yield messages.
 
-        "" is yielded regularly instead of a message, so that the caller can show the progress.
+        Yields "" regularly while there is no message, so that the caller can show the progress.
 
         Raises:
             UsageError: if the file exists, or its format cannot contain the data of the source.
@@ -315,7 +315,7 @@ class SourceRecording:
         return events
 
     def _copy(self, source: Transport, log: LimitedRecorder) -> Generator[str, None, None]:
-        """Copy a file. Data from standard input has its time of arrival."""
+        """Copy a file, or record standard input with the times of arrival."""
         clock = HostClock()
         assert self.recorder is not None
         try:
@@ -337,7 +337,8 @@ class SourceRecording:
         """Create the recorder of an open source, and start to measure `elapsed`.
 
         Raises:
-            UsageError: if the packets cannot be counted for `count`, and as for `make_recorder`.
+            UsageError: if `count` is given but packets cannot be counted, or if `make_recorder`
+                raises it.
             SourceError: if the file cannot be created.
         """
         is_decoded = sensor is not None and isinstance(source, LiveTransport)

@@ -145,7 +145,7 @@ class Replay:
     def run(self) -> Iterator[str]:
         """Send the file once, or repeatedly if `loop` is set; yield messages.
 
-        If there is no message for the user after a chunk, "" is yielded.
+        Yields "" after each chunk without a message.
 
         Raises:
             UsageError: if the file has no times, but they are required.

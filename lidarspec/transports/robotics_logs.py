@@ -2,7 +2,7 @@
 
 A driver publishes a packet, or a list of the packets of a scan, as a message. A message type
 contains packets if it has a field `packets`, or "packet" in its name. The bytes are in the field
-`data` or `buf` of a packet. The optional fields are `size`, the number of bytes, and `stamp`.
+`data` or `buf` of a packet. A packet may also have the fields `size` (number of bytes) and `stamp`.
 
 Some logs contain no definitions of their messages. Their messages are read with the definition in
 `FALLBACK_DEFINITIONS` that matches the length of the message.

@@ -213,7 +213,7 @@ def _find_wait(device: SimulatedDevice, outlet: Outlet) -> float:
 def due_chunks(
     device: SimulatedDevice, now: int, arrival_ns: int | None = None
 ) -> dict[str, list[Chunk]]:
-    """Advance a device to the time `now`; return (link, bytes) of the sent data.
+    """Advance a device to the time `now`; return the chunks that it sends, by link.
 
     Args:
         now: the device's time, ns.

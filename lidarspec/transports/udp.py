@@ -591,7 +591,7 @@ def _find_command_address(address: SourceAddress, link: Udp) -> tuple[Sender | N
 
 
 def warn_of_small_buffer(requested: int, granted: int) -> list[str]:
-    """Return a list with a warning if a receive buffer is too small; else empty.
+    """Return warnings if a receive buffer is smaller than requested.
 
     Args:
         requested: the requested size, in bytes.

@@ -83,7 +83,7 @@ class UsbDevice:
 
     Attributes:
         vendor_id, product_id: its USB ids.
-        has_driver: whether a driver makes a serial port for it.
+        has_driver: whether a driver makes a serial port for the device.
     """
 
     vendor_id: int
