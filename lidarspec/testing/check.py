@@ -572,8 +572,7 @@ class Report:
         findings: the findings.
         skipped: property -> the reason why it does not apply.
         measured: measured values of frames, by description.
-        picture: measured values of points, by description; the author compares them with the
-            manual.
+        picture: measured values of points, by description.
     """
 
     name: str

@@ -553,11 +553,7 @@ def _find_full_circle(info: FieldInfo) -> tuple[int, int] | None:
 def _decode_with_values(
     subject: SensorUnderTest, name: str, path: str, values: tuple[int, ...]
 ) -> list[PointCloud]:
-    """Decode an example with each of several values of a field; return the points.
-
-    Raises:
-        SpecError: if `points` fails.
-    """
+    """Decode an example with each of several values of a field; return the points."""
     for seed in range(1, 1 + subject.scale_rounds(TRIED_EXAMPLES, least=4)):
         parsed = subject.sensor.parse(subject.example(name, seed=seed), frame=name)
         if all(own != path for _, _, own in material.iter_integers(parsed)):

@@ -171,7 +171,7 @@ class SensorUnderTest:
         family: the ids of the sensors that share the file of golden vectors.
         tested: related models; frame types that they share with this sensor are not tested again.
         measured: measured values of frames as text, by description.
-        picture: measured values of points as text, by description, to compare with the manual.
+        picture: measured values of points as text, by description.
         traced: data frame -> the result of `geometry.trace_points`.
         placed: names of the data frames whose golden vectors have points in two quadrants.
         swept: data frame -> the packets of its `sweep` that have been made so far.
