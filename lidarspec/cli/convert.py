@@ -307,11 +307,7 @@ def _write_imu(
 
 
 def _iter_imu(device: Device, selection: Selection) -> Generator[ImuSamples]:
-    """Yield the IMU samples of the selected packets, with times by the selected clock.
-
-    Raises:
-        UsageError: if a required time is unknown, or if only some of the samples have a clock.
-    """
+    """Yield the IMU samples of the selected packets, with times by the selected clock."""
     batches = _select_frames(device, device.sensor.imu_frames, selection, None)
     frames_by_clock = dict[bool, str]()
     with contextlib.closing(batches):
@@ -327,7 +323,6 @@ def _require_same_time(packets: Packets, frames_by_clock: dict[bool, str]) -> No
     """Raise UsageError if some frame types have a clock and others have none.
 
     Args:
-        packets: the next packets.
         frames_by_clock: True -> a frame type with a clock, False -> a frame type without a clock.
             This function adds the type of `packets`.
     """
@@ -347,11 +342,6 @@ def _choose_frames(device: Device, target: str, frame: str | None) -> Sequence[s
     Args:
         frame: the requested frame type, such as "report", or type of parts, such as
             "report.tags.temperature"; None for all frame types that the sensor sends.
-
-    Raises:
-        UnknownFrame: for a frame type that the sensor does not send.
-        UnknownField: for parts that the frame does not have.
-        UsageError: if `target` can contain one frame type, and `frame` does not say which.
     """
     sensor = device.sensor
     frames = sensor.incoming
@@ -414,14 +404,7 @@ def _list_parts(sensor: Sensor, frame: str) -> list[str]:
 def _select_frames(
     device: Device, types: Sequence[str], selection: Selection, count: int | None
 ) -> Generator[dict[str, Packets]]:
-    """Yield batches with the selected frames and their parts, without empty batches.
-
-    Args:
-        types: the frame types, and the types of parts.
-
-    Raises:
-        UsageError: if a required time is unknown, or if all frames are outside the selected times.
-    """
+    """Yield batches with the selected frames and their parts, without empty batches."""
     frames = list(dict.fromkeys(name.partition(".")[0] for name in types))
     slices = {frame: TimeSlice(selection.times) for frame in frames}
     clocks = {frame: PacketTimes(selection.time, device.source) for frame in frames}
@@ -454,7 +437,6 @@ def _take_types(packets: Packets, types: Sequence[str]) -> dict[str, Packets]:
     """Return the packets of the requested types, by type, without empty packets.
 
     Args:
-        packets: packets of one frame type.
         types: the requested frame types, and types of parts such as "report.tags.temperature".
     """
     found = dict[str, Packets]()

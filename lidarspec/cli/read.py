@@ -417,12 +417,7 @@ def stats(
 def _print_stats(
     source: str, feed: LiveScans | LiveFrames, lines: StatsPrinter, interval: float, lasting: float
 ) -> MeterReading:
-    """Print the lines and the summary of one source, and return the summary.
-
-    Args:
-        interval: seconds between two lines.
-        lasting: maximum duration in seconds.
-    """
+    """Print the lines and the summary of one source, and return the summary."""
     start = time.monotonic()
     try:
         if feed.device.is_live:
@@ -442,11 +437,7 @@ def _print_stats(
 
 
 def _measure_input(feed: LiveScans | LiveFrames, start: float) -> MeterReading:
-    """Return the measured values of the whole input.
-
-    Args:
-        start: start of the measurement of a live source, a time of `time.monotonic`.
-    """
+    """Return the measured values of the whole input."""
     return feed.meter.summary(
         feed.device.stats, time.monotonic() - start if feed.device.is_live else None
     )

@@ -217,10 +217,6 @@ def _serve(
         target: "pty" or a URL.
         link: the path of a symbolic link to the pty; None for no link.
         duration: time in seconds after which the sensor stops; None for no limit.
-        as_json: whether the address is printed as JSON.
-
-    Raises:
-        UsageError: if the port is invalid, or if `link` is given for a port that is no pty.
     """
     sensor = device.sensor
     try:
@@ -334,11 +330,7 @@ def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: boo
 
 
 def _find_default_sensor() -> Sensor:
-    """Return the first installed sensor that declares a `sweep` for its data frames.
-
-    Raises:
-        UsageError: if no such sensor is installed.
-    """
+    """Return the first installed sensor that declares a `sweep` for its data frames."""
     for sensor in registry().sensors().values():
         if any(sensor.simulation_of(name).sweep for name in sensor.data_frames):
             return sensor

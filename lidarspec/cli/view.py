@@ -266,12 +266,7 @@ def _run_window(device: Device, window: Window, *, stdin_is_data: bool) -> None:
 def _draw_once(
     device: Device, source: str, ramp: str, patience: float, selection: Selection
 ) -> str:
-    """Return a picture of the first complete scan, and a line about it.
-
-    Raises:
-        CommandError: if the sensor sends nothing.
-        WireError: if the data contains no scan.
-    """
+    """Return a picture of the first complete scan, and a line about it."""
     feed = LiveScans(device, select=selection)
     end = time.monotonic() + patience
     while (
