@@ -283,10 +283,8 @@ class _PlannedData(NamedTuple):
     Attributes:
         at: the time, ns since power-on.
         number: a running number in the order of planning.
-        link: name of the link to send the data over.
         frame: the frame type; "" for bytes that are not a frame.
-        repetition: number of earlier frames of a type that is sent periodically; None for all other
-            data.
+        repetition: number of earlier periodic frames of the type; None for all other data.
     """
 
     at: float

@@ -10,8 +10,6 @@ Packets are made in four steps:
 
 To find the points that depend on a field, each field in metres is set to a probe value. If the
 sensor declares a function `encode`, this function returns the values of the fields instead.
-
-The time of each packet is calculated by `PacketTimes`.
 """
 
 from __future__ import annotations
