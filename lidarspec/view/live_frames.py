@@ -39,7 +39,6 @@ class LiveFrames:
 
     Attributes:
         packets: the packets that were read last, one batch for each frame type.
-        ended: whether the input has ended.
     """
 
     def __init__(self, device: Device) -> None:

@@ -323,12 +323,7 @@ def _iter_legend(look: CloudAppearance, right: int) -> Iterator[str]:
 
 
 def _style_of(part: str, attribute: str = "fill") -> str:
-    """Return the SVG attributes for the colour of a part of the picture.
-
-    Args:
-        part: one of `_PARTS`.
-        attribute: "fill" or "stroke".
-    """
+    """Return the SVG attributes for the colour of a part of the picture."""
     return f'class="{part}" {attribute}="{_LIGHT[_PARTS.index(part)]}"'
 
 
