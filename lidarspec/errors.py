@@ -343,9 +343,9 @@ class UnknownName(UsageError):
 
     Attributes:
         what: the kind of name, for the message.
-        min_similarity: minimum similarity of a suggested name to the unknown name, from 0 to 1.
+        min_similarity: minimum similarity of suggested names, from 0 to 1.
         max_containing: maximum number of suggested names that contain the unknown name.
-        max_listed: maximum number of names that are listed if none is suggested.
+        max_listed: maximum number of names that are listed if no name is suggested.
     """
 
     what = "name"
@@ -493,9 +493,6 @@ class WriteError(SourceError):
 
     Attributes:
         reason: the reason, without the path.
-
-    Args:
-        state: the state of the file after the error, for the message.
     """
 
     def __init__(self, path: str, reason: str, state: str) -> None:

@@ -213,7 +213,7 @@ class Plugin:
 class Registry:
     """The plugins of this environment, and the sensors with their hooks applied.
 
-    Several plugins may claim the same name, which is an id or an alias. These rules decide, in this
+    If several plugins have a sensor of the same name (id or alias), these rules decide, in this
     order, which plugin provides the sensor:
 
     * A plugin with an entry point of this name, or with hooks, has priority over a plugin whose
