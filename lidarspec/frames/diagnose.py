@@ -42,8 +42,7 @@ class Fault:
         kind: one of the constants of this module.
         path: the path of the field, with indices.
         offset: the offset of the first byte of the field in the frame.
-        expected: the expected value, as a text or number.
-        got: the actual value, as a text or number.
+        expected, got: the expected and the actual value, as a text or number.
         end: the offset up to which the frame has to be read to find the fault.
         needed: the size of a field that is cut off, in bytes; 0 for all other faults.
         is_bounded: whether the field is cut off by the end of the parts, not by the end of the

@@ -541,7 +541,6 @@ class HeaderNode:
         constants: the constants before `leaf`, or before the end of a truncated frame.
         least: the known minimum size of a frame with these values, in bytes; 0 if not known.
         value_classes: the values of `leaf` that lead to different layouts.
-        children: the child nodes by value of `leaf`.
         result: the layout or the refusal; None if not known yet.
     """
 

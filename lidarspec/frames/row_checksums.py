@@ -3,9 +3,8 @@
 `compute_over_spans` and `compute_checksums` have fast methods for the algorithms of
 `lidarspec.spec.checksums`. For an algorithm of a plugin they call its method `batch`.
 
-A CRC is linear: the register after a row is the XOR of the contributions of its bytes. *Advancing*
-a byte by d means computing its contribution to the register d bytes later. `compute_registers`
-selects the fastest of four methods.
+A CRC is linear: the register after a row is the XOR of the contributions of its bytes.
+`compute_registers` selects the fastest of four methods.
 """
 
 from __future__ import annotations
@@ -84,7 +83,7 @@ def compute_over_spans(algorithm: Checksum, rows: NDArray[np.uint8], spans: Span
 
 
 def _are_few(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> bool:
-    """Return whether it is faster to compute the rows one by one than together."""
+    """Return whether computing the checksums one by one is faster than together."""
     if not isinstance(algorithm, Crc):
         return len(rows) < MIN_BATCH_ROWS
     length = _count_bytes(spans)
@@ -377,8 +376,9 @@ def _compute_narrow(
     rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
 ) -> NDArray[np.uint8]:
     """Return the result of `compute_registers` for registers of at most one byte."""
-    # The first half of each row is advanced to the second half by a table, and XORed onto it. This
-    # is repeated until one byte is left.
+    # To advance a byte by d is to compute its contribution to the register d bytes later. The
+    # first half of each row is advanced to the second half by a table, and XORed onto it. This is
+    # repeated until one byte is left.
     length = _count_bytes(spans)
     if not length:
         return np.full(len(rows), start, np.uint8)

@@ -102,7 +102,6 @@ class ExaminedFrame:
 
     Attributes:
         root: the tree of the frame type.
-        data: the bytes.
         known: the layout, or the `HeaderWalk` with the layout up to the error in `failure`.
         failure: the error that prevented a layout; None if there is a layout.
         start: the offset of a part in the frame; 0 for a frame.
@@ -189,9 +188,7 @@ def examine(
     Args:
         limit: the maximum size of a frame, in bytes.
         given: for a part, the values of fields of the outer frame, by path.
-        start: for a part, its offset in the frame.
-        prefix: for a part, its path in the frame.
-        is_bounded: for a part, whether the frame has bytes after its parts.
+        start, prefix, is_bounded: for a part, see `ExaminedFrame`.
     """
 
     def read(leaf: Leaf | MeasuredSize, walk: HeaderWalk) -> int:
