@@ -167,7 +167,6 @@ class Framing:
         """Check the candidates of a type at these offsets.
 
         Args:
-            kind: the index of the type.
             offsets: offsets at which the constants of the type match.
             stops: the end offset of each candidate; by default the end of the buffer.
             gathered: whether to copy the bytes of candidates to `Frames.rows`.
@@ -271,7 +270,6 @@ class Candidates:
     """The candidates in a piece of a stream.
 
     Args:
-        buffer: the bytes to search.
         mode: the search state at the start of the buffer.
         final: whether no more bytes follow, so that incomplete candidates are rejected.
 

@@ -47,7 +47,6 @@ class _PartialMessage:
         place: the offset in the input of the first received fragment.
         at: the arrival time of the first received fragment, ns.
         parts: the payloads of the fragments by index.
-        size: the total size of the payloads in bytes.
     """
 
     count: int

@@ -79,11 +79,7 @@ def example(sensor: SensorDescription, frame: str, *, seed: int = 0) -> bytes:
 def random_frame(
     sensor: SensorDescription, frame: str, source: random.Random, drawn: Drawn = NOTHING
 ) -> bytes:
-    """Return a valid frame with a random header and random content.
-
-    Args:
-        drawn: functions that draw the raw values of certain fields, by path.
-    """
+    """Return a valid frame with a random header and random content."""
     engine = get_codec(sensor.frames[frame])
     if not engine.is_compiled or engine.schema.has_measured_sizes:
         return draw_frame(sensor, frame, source, drawn)
@@ -104,7 +100,6 @@ def draw_row(
 
     Args:
         frame: the name of a frame type with layouts and without parts.
-        drawn: functions that draw the raw values of certain fields, by path.
         tries: the maximum number of attempts.
 
     Raises:
@@ -133,9 +128,6 @@ def make_random_header(
     engine: Codec, source: random.Random, drawn: Drawn = NOTHING
 ) -> tuple[Layout, dict[str, int]]:
     """Return the layout of a random header, and the raw values of its fields by path.
-
-    Args:
-        drawn: functions that draw the raw values of certain fields, by path.
 
     Raises:
         SpecError: if hundreds of random headers have no layout.
@@ -229,9 +221,6 @@ def draw_frame(
     tries: int = LARGEST_BATCH * MAX_TRIES,
 ) -> bytes:
     """Draw the values of a frame one by one, and return a valid frame.
-
-    Args:
-        drawn: functions that draw the raw values of certain fields, by path.
 
     Raises:
         SpecError: if all attempts result in invalid frames.

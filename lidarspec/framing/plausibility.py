@@ -71,7 +71,6 @@ class CandidateChecker:
             to be called.
 
     Attributes:
-        checks: `struct_checks` and `plausibility_checks`.
         is_complete: whether the plausibility function need not be called.
     """
 

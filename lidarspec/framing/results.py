@@ -206,7 +206,6 @@ class Frames:
         places: the same offsets, as a range if the frames have one size and follow one another.
         rows: the bytes of each complete frame as a row, if all have one layout and the rows were
             gathered.
-        errors: the errors of the plugin.
     """
 
     def __init__(
