@@ -44,9 +44,8 @@ def virtual_port(
 
     Yields:
         An object with the attributes `path` (to open) and `device` (`device.commands_received`
-            lists the received commands), and the methods `wait_for_commands(names)`, `unplug`,
-            `plug`, `jump_clock(seconds)`, `delay(seconds)` and, with virtual time,
-            `advance(seconds)`.
+        lists the received commands), and the methods `wait_for_commands(names)`, `unplug`, `plug`,
+        `jump_clock(seconds)`, `delay(seconds)` and, with virtual time, `advance(seconds)`.
 
     Raises:
         SourceError: if the port cannot be opened.

@@ -630,7 +630,7 @@ def distance_outside(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64
 def find_half_step(subject: SensorUnderTest, name: str) -> float:
     """Return half of the largest step of the length fields of a frame, in metres.
 
-    Returns `MIN_HALF_STEP_M` if no field has a larger step.
+    Returns `MIN_HALF_STEP_M` if no step is larger than `MIN_HALF_STEP_M`.
     """
     fields = subject.fields(name).values()
     metres = [
