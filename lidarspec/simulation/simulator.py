@@ -1066,7 +1066,7 @@ def find_followed_scale(sensor: Sensor) -> str:
 
     Returns:
         "utc", "tai" or "gps"; "" if the clock is not synchronized, or if no date can be written
-            into the clock.
+        into the clock.
     """
     others = FramesWithoutPoints(sensor)
     try:
