@@ -320,7 +320,7 @@ class RateSeries:
 
         Returns:
             The edges of the steps, (n + 1,) seconds, and the numbers of packets, lost packets and
-                invalid frames in each step, (3, n).
+            invalid frames in each step, (3, n).
         """
         if self._last < self.width:
             raise UsageError(
