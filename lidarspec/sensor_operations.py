@@ -88,9 +88,10 @@ class Sensor(SensorDescription):
         """Parse exactly one frame; return a construct Container of raw integers.
 
         Args:
-            frame: the name of its type; by default it is identified.
+            frame: the name of the frame type; by default, the type is identified.
             verify: if False, wrong constants, a wrong checksum and trailing bytes are accepted.
-            units: whether to return scaled fields in their units, as ``build(units=True)`` accepts.
+            units: whether to return scaled fields in their units; ``build(units=True)`` accepts the
+                result.
 
         Raises:
             WireError: if the bytes are not a valid frame of the type. The error has the sensor, the
