@@ -1,8 +1,7 @@
 """Prepare construct structs for the engine, and translate them to the frame tree.
 
-No other package of the engine uses construct's classes. `prepare` returns a copy of a plugin's
-struct for the engine, `check_struct` raises an error if the struct is not supported, and
-`frame_tree` returns the tree of the struct. Modules in reading order:
+`prepare` returns a copy of a plugin's struct for the engine, `check_struct` raises an error if the
+struct is not supported, and `frame_tree` returns the tree of the struct. Modules in reading order:
 
 * `replacements`: classes that replace classes of construct, and additional classes.
 * `adapters`: converts adapters and texts to functions of raw values.

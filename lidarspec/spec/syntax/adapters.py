@@ -1,9 +1,7 @@
 """Convert adapters of construct to functions between raw and decoded values.
 
-The engine calls an adapter with values of its field, without construct's context. If the adapter
-needs a context, or fails for some numbers, only construct can apply it. To find this out, the
-adapter is tried with all values of a byte, or with several hundred values of a wider field. An
-adapter is not supported if encoding a decoded value does not give the raw value again.
+An adapter is tried with all values of a byte, or with several hundred values of a wider field. If
+the adapter needs construct's context, or fails for some numbers, only construct can apply it.
 """
 
 from __future__ import annotations
@@ -64,9 +62,9 @@ class Trial:
 
 
 def make_int_adapter(con: Construct) -> tree.Adapter | None:
-    """Return the functions that decode and encode an integer with an adapter.
+    """Return the functions that decode and encode an integer, or None.
 
-    Returns None for other constructs, and if only construct can apply the adapter.
+    None means that the construct is no adapter, or that only construct can apply it.
     """
     if not is_int_adapter(con):
         return None
@@ -97,10 +95,7 @@ def without_int_adapters(con: Construct) -> Construct:
 
 
 def is_int_adapter(con: Construct) -> bool:
-    """Return whether a construct is an adapter that converts an integer.
-
-    Returns False for the adapters of construct in `_KNOWN`, which are handled elsewhere.
-    """
+    """Return whether a construct is an adapter that converts an integer."""
     if not isinstance(con, construct.Adapter) or isinstance(con, _KNOWN):
         return False
     return _int_bits(con.subcon) > 0
@@ -199,9 +194,6 @@ def make_text_adapter(con: construct.StringEncoded) -> tree.Adapter:
 def make_number_adapter(con: Construct) -> tree.Adapter:
     """Return the functions that decode and encode a number of variable size.
 
-    A number is invalid if it needs more than 64 bits, or if construct encodes it to bytes that
-    differ from the decoded bytes.
-
     Args:
         con: construct's VarInt or ZigZag.
     """
@@ -241,11 +233,7 @@ def _encode_text(con: Any, stripped: Any, value: Any, size: int) -> bytes:
 
 
 def make_part_adapter(con: Construct) -> tree.Adapter | None:
-    """Return the functions that decode and encode an independent part.
-
-    Returns:
-        None if the part depends on other bytes, or if only construct can read the part.
-    """
+    """Return the functions that decode and encode an independent part, or None."""
     size = fixed_size(con)
     if not is_independent(con):
         return None
@@ -278,10 +266,7 @@ def make_part_adapter(con: Construct) -> tree.Adapter | None:
 
 
 def _find_byte_decoder(con: Construct) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None:
-    """Return a function that decodes arrays of bytes.
-
-    Returns None if decoding may change the size.
-    """
+    """Return a function that decodes arrays of bytes, or None."""
     xor = _find_xor(con)
     if xor is None or not isinstance(xor.subcon, construct.Bytes | type(construct.GreedyBytes)):
         return None

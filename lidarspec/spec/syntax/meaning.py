@@ -1,9 +1,8 @@
-"""Translate a construct struct to the nodes of `lidarspec.spec.tree`, once for each frame type.
+"""Translate a construct struct to the nodes of `lidarspec.spec.tree`.
 
-* Expressions (counts, conditions, keys) are traced: they are called with symbols in place of
-  fields, and the operations on the symbols are recorded as a formula.
-* The bit positions of a bit block are found by parsing test patterns with construct, so this module
-  has no rules about the order of bits.
+* Expressions (counts, conditions, keys) are called with symbols in place of fields, and the
+  operations on the symbols are recorded as a formula.
+* The bit positions of a bit block are found by parsing test patterns with construct.
 * A construct that no node can represent becomes `tree.Opaque`, with the reason. Only construct can
   parse it, one frame at a time.
 """
@@ -74,28 +73,23 @@ def frame_tree(con: Construct) -> tree.Node:
 
 
 def _build_twice(build: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
-    """Call `build` with a builder; return its node and the builder.
-
-    If a value in built frames depends on a later field, `build` is called again with a builder that
-    knows the fields and sizes from the first call.
-    """
+    """Call `build` once or twice, and return the node and the builder."""
     builder = _Builder()
     root = build(builder)
     if builder.rebuilding:
+        # The second builder knows the fields and sizes from the first call.
         builder = _Builder(builder)
         root = build(builder)
     return root, builder
 
 
 def _trace(expression: Any, scope: tree.Scope) -> Any:
-    """Evaluate an expression with symbols in place of the fields.
-
-    construct's own evaluation of ``~`` is ``not value``, which a symbol does not support.
-    """
+    """Evaluate an expression with symbols in place of the fields."""
     if isinstance(expression, BinExpr):
         return expression.op(_trace(expression.lhs, scope), _trace(expression.rhs, scope))
     if isinstance(expression, UniExpr):
         operand = _trace(expression.operand, scope)
+        # construct evaluates ``~`` as ``not value``, which a symbol does not support.
         if expression.op is operator.not_ and isinstance(operand, tree.Symbol):
             return tree.Symbol(tree.Op("not", (operand.formula,)))
         return expression.op(operand)
@@ -105,11 +99,7 @@ def _trace(expression: Any, scope: tree.Scope) -> Any:
 
 
 def _format_expression(expression: Any, path: str) -> str:
-    """Return an expression as text with whole paths of fields; "?" for a function.
-
-    Args:
-        path: the path of the part that contains the expression.
-    """
+    """Return an expression as text with whole paths of fields; "?" for a function."""
     text = repr(expression)
     if " at 0x" in text:
         return "?"
@@ -141,7 +131,6 @@ class _Context:
         info: the facts about the field that its surrounding constructs declare.
         scope: the fields that expressions can refer to.
         name: the name of the construct in its struct; "" without a name.
-        in_bits: whether the construct is inside a bit block.
     """
 
     info: tree.FieldInfo
@@ -170,8 +159,7 @@ class _Builder:
         scopes: the scope of each struct after all its members were added, by path.
         sizes: the formula of each SizeOf field, in the order of the fields; None while it is
             unknown.
-        rebuilding: whether a second pass is required, because a value in built frames may depend on
-            later fields.
+        rebuilding: whether a second pass is required.
     """
 
     def __init__(self, before: _Builder | None = None) -> None:
@@ -247,11 +235,7 @@ class _Builder:
         return self._make_leaf(inner, place)
 
     def _make_derived(self, con: Construct, place: _Context) -> tree.Node | None:
-        """Return the node of a value without bytes of its own.
-
-        Returns None if the construct has bytes of its own, or if only construct can compute the
-        value.
-        """
+        """Return the node of a value without bytes of its own, or None."""
         if isinstance(con, construct.Computed):
             return self._make_computed(con, place)
         if con is construct.Tell and place.offset is not None:
@@ -339,7 +323,7 @@ class _Builder:
         """Remove the wrappers that only describe a field, for example its name and unit.
 
         Returns:
-            The wrapped construct, and the context with the facts that the wrappers declare.
+            The wrapped construct, and the context with the facts of the wrappers.
         """
         while True:
             if isinstance(con, construct.Renamed):
@@ -379,10 +363,7 @@ class _Builder:
             con = con.subcon
 
     def _find_adapter(self, con: Construct, info: tree.FieldInfo) -> tree.Adapter | None:
-        """Return the adapter of an integer field.
-
-        Returns None if the field has a constant, labels or a scale.
-        """
+        """Return the adapter of an integer field; None with a constant, labels or a scale."""
         if info.const is not None or info.labels or info.scaled or info.rebuilt or info.adapter:
             return None
         return make_int_adapter(con)
@@ -403,8 +384,6 @@ class _Builder:
         may_be_fraction: bool = False,
     ) -> tree.Formula:
         """Return a count, length, condition, key or computed value as a formula.
-
-        Returns `tree.Untraced` with the reason if it cannot be converted.
 
         Args:
             known: the scope of the expression; by default the scope of `place`.
@@ -549,11 +528,7 @@ class _Builder:
         return tree.calculate("%", tree.calculate("-", size), number)
 
     def _measure_part(self, con: SizeField, place: _Context) -> tree.Formula | None:
-        """Return the formula for the size of a part; None in the first pass.
-
-        Also registers the SizeOf field, so that `_make_struct` computes the size when the struct is
-        complete.
-        """
+        """Return the formula for the size of a part; None in the first pass."""
         scope = place.scope
         self.rebuilding = True
         for _ in range(con.levels_up):
@@ -564,6 +539,7 @@ class _Builder:
                 path=place.info.path,
             )
         index = len(self.sizes)
+        # `_make_struct` computes the size when the struct is complete.
         self._measured[scope].append((index, con))
         self.sizes.append(None)
         size = self._sizes[index] if self._sizes else None
@@ -575,11 +551,7 @@ class _Builder:
     def _make_elements(
         self, con: construct.GreedyRange | construct.RepeatUntil, place: _Context
     ) -> tree.Node:
-        """Return the node of construct's GreedyRange or RepeatUntil.
-
-        It is an array if all elements have the same fixed size, else a `PartSequence`. If neither
-        is possible, it is a node that only construct can read.
-        """
+        """Return the node of construct's GreedyRange or RepeatUntil."""
         axis = axis_path(place.info)
         element = self.node(
             con.subcon,
@@ -659,9 +631,7 @@ class _Builder:
         within: tree.Formula | None = None,
         until: Any = None,
     ) -> tree.PartSequence | None:
-        """Return the elements of an array as a sequence of parts.
-
-        Returns None if an element is not a struct, is in another array, or cannot be compiled.
+        """Return the elements of an array as a sequence of parts; None if unsupported.
 
         Args:
             con: the construct of an element.
@@ -715,7 +685,6 @@ class _Builder:
         """Return the node of a part as a frame of its own, and the formula of `following`.
 
         Args:
-            case: the construct of the part.
             following: an expression of fields of the part; None for no formula.
         """
 
@@ -734,11 +703,7 @@ class _Builder:
         return root, rule
 
     def _make_check(self, con: construct.Check, place: _Context) -> tree.Node:
-        """Return the node of a condition.
-
-        If the condition uses fields of another array or frame, or if its values may exceed 64 bits,
-        only construct can check it.
-        """
+        """Return the node of a condition."""
         condition = self._to_formula(con.func, place)
         info = place.info
         if isinstance(condition, int):
@@ -839,10 +804,7 @@ class _Builder:
         return node
 
     def _make_encoded_blob(self, con: Construct, place: _Context) -> tree.Blob | None:
-        """Return a node of bytes with functions that decode them.
-
-        Returns None if only construct can read the bytes.
-        """
+        """Return a node of bytes with functions that decode them, or None."""
         info = place.info
         if not place.name or info.const is not None or info.labels or info.rebuilt:
             return None
@@ -933,11 +895,7 @@ def _to_scope_value(info: tree.FieldInfo) -> tree.Ref | tree.Value:
 
 
 def _is_always_defined(formula: tree.Formula) -> bool:
-    """Return whether an operation is defined for all values of its fields.
-
-    Division, modulo and shifts are defined for all values only if the right operand is a positive
-    constant.
-    """
+    """Return whether an operation is defined for all values of its fields."""
     if not isinstance(formula, tree.Op) or formula.symbol not in ("/", "//", "%", "<<", ">>"):
         return True
     divisor = formula.args[1]
@@ -957,10 +915,7 @@ def _differ_in_layout(element: tree.Node, axis: str) -> bool:
 
 
 def _iter_formulas(root: tree.Node, *others: tree.Formula | None) -> Iterator[tree.Formula]:
-    """Yield the formulas of all nodes and fields of a frame, and then `others`.
-
-    A None in `others` is left out.
-    """
+    """Yield the formulas of all nodes and fields of a frame, and then `others`."""
     for node in tree.nodes(root):
         yield from tree.formulas(node)
         for info in tree.infos(node):
@@ -971,17 +926,15 @@ def _iter_formulas(root: tree.Node, *others: tree.Formula | None) -> Iterator[tr
 
 
 def _trace_predicate(predicate: Any, scope: tree.Scope) -> Any:
-    """Trace the predicate of a RepeatUntil for one element.
-
-    The predicate gets None instead of the list of elements.
-    """
+    """Trace the predicate of a RepeatUntil for one element."""
     if isinstance(predicate, ExprMixin):
         return _trace(predicate, scope)
+    # None stands for the list of elements.
     return predicate(scope, None, scope.parent)
 
 
 def _return_no_offset() -> None:
-    """Return None: each element of an array has a different offset."""
+    """Return None, because each element of an array has a different offset."""
     return
 
 
@@ -993,12 +946,7 @@ def _find_offset_after(
 
 
 def _is_single_value(ref: tree.Ref, info: tree.FieldInfo) -> bool:
-    """Return whether a field has one number for each element of a computed value.
-
-    Args:
-        ref: a reference to the field.
-        info: the description of the computed value.
-    """
+    """Return whether a field has one number for each element of a computed value."""
     return (
         not ref.path.startswith("_.")
         and ref.info.kind in ("int", "float")
@@ -1015,11 +963,8 @@ def _describe_integer(info: tree.FieldInfo) -> tree.FieldInfo:
 def _make_peeked(derived: tree.Derived, behind: Sequence[tree.Node]) -> tree.Node:
     """Return the node of a field that construct's Peek reads.
 
-    If the field may extend beyond the frame, the result is a node that only construct can read.
-
     Args:
-        derived: the node of the field.
-        behind: the nodes after it.
+        behind: the nodes after the field.
     """
     assert derived.node is not None
     needed = tree.size(derived.node)
@@ -1059,7 +1004,6 @@ def _sum_member_sizes(
     """Return the size of consecutive members of a struct.
 
     Args:
-        first: the name of the first member.
         last: the name of the last member; "" for `first` alone.
     """
     names = [member.name for member in members]
@@ -1159,10 +1103,7 @@ def _make_number(info: tree.FieldInfo, size: int, *, is_big: bool) -> tree.Numbe
 
 
 def axis_path(info: tree.FieldInfo) -> str:
-    """Return the name of the axis of an array field.
-
-    If an array is directly inside an array, "[]" is appended to the path.
-    """
+    """Return the path of an array field; "[]" is appended for an array in an array."""
     path = info.path
     while path in info.axes:
         path += "[]"
@@ -1243,8 +1184,6 @@ def _find_ending(con: Construct, info: tree.FieldInfo, *, is_bounded: bool) -> t
     """Return the mark that ends a field of variable size; None if no mark ends it.
 
     Args:
-        con: the construct of the field.
-        info: the description of the field.
         is_bounded: whether the field is in a part of known size.
     """
     size = _describe_integer(
@@ -1270,10 +1209,7 @@ def _find_ending(con: Construct, info: tree.FieldInfo, *, is_bounded: bool) -> t
 
 
 def _make_ended_adapter(con: Construct) -> tree.Adapter | None:
-    """Return the functions that decode a text or number of variable size.
-
-    Returns None if the bytes are not decoded.
-    """
+    """Return the functions that decode a text or number of variable size, or None."""
     if isinstance(con, construct.StringEncoded):
         return make_text_adapter(con)
     if con in (construct.VarInt, construct.ZigZag):
@@ -1308,21 +1244,15 @@ def _is_variable_integer(con: BytesInteger) -> bool:
 
 @functools.lru_cache(maxsize=4096)
 def _probe_block(con: Construct, size: int) -> list[BitField] | None:
-    """Return the bit fields of a block.
-
-    Returns None if values in the block determine which fields follow, or if a field is not a plain
-    integer.
-    """
+    """Return the bit fields of a block; None if they vary or are not plain integers."""
+    # If a value determines which fields follow, probing with a few patterns can miss a variant.
     if _has_fixed_fields(con):
         return probe(lambda block: dict(iter_leaves(con.parse(block, _verify=False))), size)
     return None
 
 
 def _has_fixed_fields(con: Construct) -> bool:
-    """Return whether a bit block has the same fields for all bit patterns.
-
-    If a value determined which fields follow, probing with a few patterns could miss a variant.
-    """
+    """Return whether a bit block has the same fields for all bit patterns."""
     if isinstance(con, Struct):
         return all(map(_has_fixed_fields, con.subcons))
     if isinstance(con, Subconstruct):

@@ -103,11 +103,11 @@ def seal(struct: Construct, seals: Sequence[dict[str, Any]]) -> Construct:
 def _find_covered_part(
     checksum: Construct, members: Sequence[Construct]
 ) -> tuple[tuple[str, ...], bool] | None:
-    """Find the RawCopy that a checksum covers.
+    """Find the RawCopy that a checksum covers, or return None.
 
     Returns:
         The names that lead to the RawCopy, and whether the function of the checksum takes the whole
-        value of the RawCopy. None if the checksum does not cover a RawCopy.
+        value of the RawCopy.
     """
     if not isinstance(checksum, construct.Checksum):
         return None

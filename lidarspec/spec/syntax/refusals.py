@@ -1,7 +1,6 @@
 """Raise errors for structs that cannot describe a frame.
 
-Examples are structs with two members of the same name, and constructs that lose bits, run code or
-have no end. The error has the path and the reason.
+Examples are structs with two members of the same name, and constructs that lose bits.
 """
 
 from __future__ import annotations
@@ -96,11 +95,11 @@ def check_struct(con: Construct) -> SpecError | None:
     """Raise `SpecError` if a construct cannot describe a frame.
 
     Returns:
-        An error if the frames have no end in a byte stream; None if they have an end.
+        An error if the frames have no end in a byte stream, else None.
 
     Raises:
         SpecError: for a shadowed, reserved, duplicate or missing name, or for a construct that
-            loses bits or has no end. The error has the path and the reason.
+            loses bits or has no end.
     """
     endless = _check_ends(con, "", bounded=False)
     constructs = list(_iter_constructs(con, "", in_bits=False))
@@ -147,17 +146,13 @@ def _check_class(part: Construct, path: str, *, in_bits: bool) -> None:
 def _check_ends(
     con: Construct, path: str, *, bounded: bool, is_last: bool = True
 ) -> SpecError | None:
-    """Raise SpecError for greedy parts not at the end, and for parts that lose bytes.
-
-    A greedy part reads all available bytes. It is valid as the last part of the frame, or of a part
-    that has an end.
+    """Raise SpecError if a part that reads all available bytes is not the last part.
 
     Returns:
-        An error if the last part of the frame is greedy, so that the frame has no end in a stream;
-        None if the frame has an end.
+        An error if the last part of the frame reads all bytes of a stream, else None.
 
     Raises:
-        SpecError: if other parts follow a greedy part without an end, or if a part loses bytes.
+        SpecError: if another part follows, or if a part loses bytes.
     """
     if isinstance(con, construct.Renamed):
         path = f"{path}.{con.name}".strip(".")
@@ -277,10 +272,7 @@ def _check_measures(
     measure: tuple[float, float, str],
     measures_by_path: dict[str, tuple[float, float, str]],
 ) -> None:
-    """Raise SpecError for a field whose branches have different scales or units.
-
-    The field becomes one column, which has one scale and one unit.
-    """
+    """Raise SpecError for a field whose branches have different scales or units."""
     if isinstance(con, construct.Renamed):
         if path:
             path = f"{path}.{con.name}"

@@ -1,13 +1,10 @@
-"""The classes of a prepared struct: replacements of construct's classes, and new ones.
+"""The classes of a prepared struct: replacements for construct's, and new classes.
 
 `prepare` replaces a class of construct if the class loses bytes, does not report the offset of an
-error, or cannot parse without verification. Most frames have a layout and are read without these
-classes. construct uses the classes to parse and build frames without a layout, one at a time, and
-to build the examples of frames with parts. `tests/frames/test_plain.py` fails if a replacement is
-missing.
+error, or cannot parse without verification. Most frames are read without these classes.
+`tests/frames/test_plain.py` fails if a replacement is missing.
 
-The additional classes provide units, checksums, sizes, fillers and sequences of parts, which
-construct does not have. Plugins use them through `lidarspec.spec.fields`.
+Plugins use the new classes through `lidarspec.spec.fields`.
 """
 
 from __future__ import annotations
@@ -95,9 +92,7 @@ def get_member(obj: Any, dotted: str, default: object = _MISSING) -> Any:
 class MeasuredStruct(Struct):  # type: ignore[misc]
     """A Struct that adds the offsets of its members to the parsed value.
 
-    The entry ``_spans`` of the value has the (start, end) of each member, by name. construct's
-    Struct does not keep these offsets. They are needed for checksums, for the sizes of parts, and
-    by `explain`.
+    The entry ``_spans`` of the value has the (start, end) of each member, by name.
     """
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
@@ -139,11 +134,7 @@ class MeasuredStruct(Struct):  # type: ignore[misc]
         return inner
 
     def _make_inner_context(self, stream: Any, context: Any, *, is_parsing: bool) -> Container:
-        """Return the context of the members' expressions.
-
-        The entry `_spans` has (start, end) of each member by name. `_sizings` has (SizeField, path,
-        offset, value) for each field that declares a size.
-        """
+        """Return the context of the members' expressions."""
         inner = Container(
             _=context,
             _params=context._params,
@@ -161,12 +152,9 @@ class MeasuredStruct(Struct):  # type: ignore[misc]
         return inner
 
 
+# construct's Array takes minutes if an invalid count is large and its elements have no bytes.
 class IndexedArray(Array):  # type: ignore[misc]
     """An Array that limits its elements, and reports the index of an invalid element.
-
-    construct's Array reports no index, and takes minutes if an invalid count is large and its
-    elements have no bytes. All arrays of a frame together may have at most `limit` elements without
-    bytes.
 
     Attributes:
         limit: the maximum size of a frame, in bytes, or in bits inside a bit block.
@@ -200,12 +188,9 @@ class IndexedArray(Array):  # type: ignore[misc]
         return _build_elements(self, obj, stream, context, path)
 
 
+# construct's GreedyRange ends at an element that fails, and loses all bytes after it.
 class FullRange(construct.GreedyRange):  # type: ignore[misc]
-    """A GreedyRange that reads all bytes of its enclosing part.
-
-    construct's GreedyRange ends without an error at an element that fails, and loses all bytes
-    after it.
-    """
+    """A GreedyRange that reads all bytes of its enclosing part."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         elements = construct.ListContainer()
@@ -239,11 +224,7 @@ def _build_elements(
 
 
 class CheckedConst(Const):  # type: ignore[misc]
-    """A Const that can be parsed without verification.
-
-    With verification, a wrong constant raises `MismatchError` with its offset and both values.
-    ``parse(verify=False)`` and `explain` also parse frames with wrong constants.
-    """
+    """A Const that can be parsed without verification."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
@@ -256,10 +237,7 @@ class CheckedConst(Const):  # type: ignore[misc]
 
 
 class LimitedNumber(Subconstruct):  # type: ignore[misc]
-    """A number that accepts only some raw values.
-
-    It replaces OneOf, NoneOf and Mapping of construct.
-    """
+    """A number that accepts only some raw values, like construct's OneOf and NoneOf."""
 
     def __init__(self, subcon: Construct, allowed: tuple[int, ...]) -> None:
         super().__init__(subcon)
@@ -290,12 +268,9 @@ class SkippableCheck(construct.Check):  # type: ignore[misc]
         return None
 
 
+# construct's Bytes reports an incomplete frame, so a decoder would wait for more bytes.
 class CountedBytes(Bytes):  # type: ignore[misc]
-    """Bytes that raise `RangeError` if their length is too large for a frame.
-
-    construct's Bytes reports the end of the stream instead, as for an incomplete frame. A decoder
-    would then wait for more bytes.
-    """
+    """Bytes that raise `RangeError` if their length is too large for a frame."""
 
     limit: int
 
@@ -323,11 +298,9 @@ class FastNullTerminated(construct.NullTerminated):  # type: ignore[misc]
         return self.subcon._parsereport(within, context, path)
 
 
+# construct's FormatField builds a signalling NaN as a quiet NaN.
 class ExactFloat(FormatField):  # type: ignore[misc]
-    """A float field that keeps the bits of a NaN.
-
-    construct's FormatField builds a signalling NaN as a quiet NaN.
-    """
+    """A float field that keeps the bits of a NaN."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         raw = construct.stream_read(stream, self.length, path)
@@ -343,12 +316,10 @@ class ExactFloat(FormatField):  # type: ignore[misc]
         return super()._build(obj, stream, context, path)
 
 
+# If a frame is built from the number, construct's Enum gives expressions the number, so the key of
+# a Switch matches no case.
 class NamedEnum(construct.Enum):  # type: ignore[misc]
-    """An Enum that gives expressions its name, both in parsed and in built frames.
-
-    If a frame is built from the number, construct's Enum gives expressions the number. The key of a
-    Switch would then match no case.
-    """
+    """An Enum that expressions compare by name, in parsed and in built frames."""
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         raw = self._encode(obj, context, path)
@@ -356,11 +327,9 @@ class NamedEnum(construct.Enum):  # type: ignore[misc]
         return self._decode(raw, context, path)
 
 
+# construct's RawCopy builds from `data`, and ignores a changed `value`.
 class RawPart(Construct):  # type: ignore[misc]
-    """A part with its bytes and offsets, like construct's RawCopy.
-
-    `build` uses `value`. construct's RawCopy uses `data` instead, and ignores a changed `value`.
-    """
+    """A part with its bytes and offsets, like construct's RawCopy, built from `value`."""
 
     def __init__(self, subcon: Construct) -> None:
         super().__init__()
@@ -400,10 +369,7 @@ class RawPart(Construct):  # type: ignore[misc]
 
 
 class CheckedChecksum(construct.Checksum):  # type: ignore[misc]
-    """A Checksum that can be parsed without verification.
-
-    With verification, a wrong checksum raises `MismatchError` with its offset and both values.
-    """
+    """A Checksum that can be parsed without verification."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
@@ -440,10 +406,7 @@ class CheckedCompressed(construct.Compressed):  # type: ignore[misc]
 
 
 class Reserved(CountedBytes):
-    """Reserved bytes, in place of construct's Padding, which loses them.
-
-    If no value is given, `build` repeats the byte `pattern`.
-    """
+    """Reserved bytes, in place of construct's Padding, which loses them."""
 
     def __init__(self, length: Any, pattern: bytes = b"\0") -> None:
         super().__init__(length)
@@ -488,15 +451,11 @@ class SealedStruct(Subconstruct):  # type: ignore[misc]
 class SizeField(Subconstruct):  # type: ignore[misc]
     """A number that declares the size of a part.
 
-    `build` sets it to the size of the part. A parsed frame is invalid if the number differs from
-    this size.
-
     Attributes:
-        of: the names that lead from the struct with this field to the part. The name "_" leads to
-            the outer struct. If there are no names, the part is the struct itself.
+        of: the names that lead from the struct with this field to the part; "_" leads to the outer
+            struct.
         plus: a number that is added to the size.
-        since: the name of an earlier member; the size includes all bytes from this member to the
-            part. "" for the size of the part alone.
+        since: the name of an earlier member from which bytes are counted; "" for the part alone.
     """
 
     def __init__(
@@ -542,10 +501,7 @@ class SizeField(Subconstruct):  # type: ignore[misc]
         return self.subcon._build(sizes.get(path, obj or 0), stream, context, path)
 
     def _register_size(self, context: Any, entry: tuple[str, int, Any]) -> None:
-        """Register this field in the struct that contains the part.
-
-        The struct checks or computes the size. When a bit block is probed, there is no such struct.
-        """
+        """Register this field in the struct that contains the part."""
         for _ in range(self.levels_up):
             context = context.get("_", {})
         context.get("_sizings", []).append((self, *entry))
@@ -553,8 +509,6 @@ class SizeField(Subconstruct):  # type: ignore[misc]
 
 class CountField(Subconstruct):  # type: ignore[misc]
     """A field with the number of elements of a later array.
-
-    `build` sets it to the length of the array and ignores a given value.
 
     Attributes:
         of: the name of the array.
@@ -573,10 +527,7 @@ class CountField(Subconstruct):  # type: ignore[misc]
 
 
 class BoundedPart(Subconstruct):  # type: ignore[misc]
-    """A part that is parsed from `length` bytes.
-
-    `build` ignores `length`, and writes all bytes of the given values.
-    """
+    """A part that is parsed from `length` bytes."""
 
     def __init__(self, length: Any, subcon: Construct) -> None:
         super().__init__(subcon)
@@ -598,9 +549,8 @@ class PaddingField(CountedBytes):
 
     Args:
         of: the names of the first and the last of the members.
-        to: the total size of members and padding, in bytes; None if `modulus` is given.
-        modulus: a number of bytes; the total size is a multiple of this number. None if `to` is
-            given.
+        to: the total size of members and padding, in bytes, or None.
+        modulus: the total size is a multiple of this number of bytes; None if `to` is given.
         pattern: the byte that `build` repeats if no value is given.
     """
 

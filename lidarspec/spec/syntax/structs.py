@@ -1,8 +1,4 @@
-"""Prepare a plugin's struct, find properties of constructs, draw random values.
-
-`prepare` copies a struct and replaces some of construct's classes, for the reasons in
-`replacements`. Lengths, counts and padding that construct hides become members of the struct.
-"""
+"""Prepare a plugin's struct, find properties of constructs, draw random values."""
 
 from __future__ import annotations
 
@@ -196,10 +192,7 @@ def _strip_name(con: Construct) -> Construct:
 
 
 def _bind(con: construct.LazyBound, limit: int, *, in_bits: bool) -> Construct:
-    """Return the construct of a LazyBound.
-
-    If the LazyBound is inside its own content, it is returned unchanged.
-    """
+    """Return the construct of a LazyBound, or a recursive LazyBound unchanged."""
     if con in _BINDING:
         return con
     _BINDING.append(con)
@@ -231,12 +224,7 @@ def _name_padding(members: list[Construct]) -> list[Construct]:
 
 
 def _replace_padding(con: construct.Padded, *, in_bits: bool) -> Construct | None:
-    """Return the construct that replaces padding or a padded struct.
-
-    Returns:
-        For padding alone, a field of its bytes or bits. For a padded struct of fixed size, a struct
-        with the padding as its last member. Otherwise None.
-    """
+    """Return the field or struct that replaces padding or a padded struct, or None."""
     if con.subcon is construct.Pass and in_bits:
         return construct.Default(BitsInteger(con.length), 0)
     if con.subcon is construct.Pass:
@@ -250,12 +238,7 @@ def _replace_padding(con: construct.Padded, *, in_bits: bool) -> Construct | Non
 
 
 def _expand_macro(con: Construct) -> list[Construct]:
-    """Return the members that replace a prefixed, padded or aligned member.
-
-    They are the member itself, and a field for the length, count or padding that construct hides.
-    If the member is a ProcessXor of a struct, in a part of known size, the ProcessXor is applied to
-    each member of the struct instead. All other members are returned unchanged.
-    """
+    """Return the members that replace a prefixed, padded or aligned member."""
     inner = _strip_name(con)
     if not con.name:
         return [con]
@@ -300,11 +283,7 @@ def _is_pascal_string(con: Construct) -> bool:
 
 
 def _distribute_xor(con: Construct) -> Construct:
-    """Apply the ProcessXor of a struct to each member of the struct.
-
-    Returns the construct unchanged if it is not a ProcessXor of a struct, or if the bytes of a
-    member are not known.
-    """
+    """Apply the ProcessXor of a struct to each member of the struct."""
     if not isinstance(con, construct.ProcessXor) or not isinstance(con.subcon, Struct):
         return con
     key = find_xor_key(con)
@@ -337,9 +316,7 @@ def _name_field(con: Construct, ending: str, field: Construct, what: str) -> Con
     """Return a hidden field, named and documented by the name of a member.
 
     Args:
-        con: the member.
         ending: the text after the member's name in the name of the field.
-        field: the hidden field.
         what: the text before the member's name in the documentation of the field.
     """
     return construct.Renamed(field, newname=con.name + ending, newdocs=f"{what} {con.name}")
@@ -374,10 +351,7 @@ def _expand_prefixed(con: Construct, inner: construct.Prefixed) -> list[Construc
 
 
 def _expand_focused(con: Construct, inner: construct.FocusedSeq) -> list[Construct]:
-    """Return the members that replace a FocusedSeq: its value, and its other parts.
-
-    If this is not possible, the FocusedSeq is returned unchanged.
-    """
+    """Return the members that replace a FocusedSeq: its value, and its other parts."""
     focus = inner.parsebuildfrom
     parts = {part.name: _strip_name(part) for part in inner.subcons}
     others = [part for part in inner.subcons if part.name != focus]
@@ -410,14 +384,7 @@ COUNT_TRIALS = (0, 1, 3, *((1 << bit) - 1 for bit in range(3, 17)))
 
 
 def _to_count_field(member: Construct, later: Sequence[Construct]) -> Construct:
-    """Return a `CountField` if a member counts the elements of a later member.
-
-    Otherwise, the member is returned unchanged.
-
-    Args:
-        member: a member of a struct.
-        later: the members after it.
-    """
+    """Return a `CountField` if a member counts the elements of a later member."""
     content = _strip_name(member)
     if not member.name or not isinstance(content, construct.Rebuild):
         return member
@@ -437,8 +404,6 @@ def _find_count(array: Construct | None, parts: Mapping[str, Construct], focus: 
     """Return the name of the part of a FocusedSeq that counts an array.
 
     Args:
-        array: the array.
-        parts: the parts of the FocusedSeq, by name.
         focus: the name of the array.
     """
     if not isinstance(array, Array):
@@ -447,14 +412,7 @@ def _find_count(array: Construct | None, parts: Mapping[str, Construct], focus: 
 
 
 def _is_count(part: Construct, name: str, array: Construct, array_name: str) -> bool:
-    """Return whether a part of a struct is a Rebuild that counts an array or bytes.
-
-    Args:
-        part: the part.
-        name: its name.
-        array: the array, or the bytes.
-        array_name: the name of the array or bytes.
-    """
+    """Return whether a part of a struct is a Rebuild that counts an array or bytes."""
     if isinstance(array, Array):
         count = array.count
     elif isinstance(array, Bytes):
@@ -493,11 +451,7 @@ class _ComparisonRecorder:
 
 
 def _find_allowed(con: construct.Validator) -> tuple[int, ...] | None:
-    """Return the raw values that a validator accepts; None if they are unknown.
-
-    If the validator compares the value with integers, these integers are tried. Otherwise all
-    values of a field of up to 16 bits are tried.
-    """
+    """Return the raw values that a validator accepts; None if they are unknown."""
     field = unwrap(con)
     subcon = con.subcon
     while isinstance(subcon, Subconstruct) and not isinstance(subcon, construct.Enum):
@@ -541,8 +495,7 @@ def is_greedy(
     """Return whether a part reads all bytes that are available.
 
     Args:
-        kinds: the constructs that read all bytes. A part that ends with such a construct also reads
-            all bytes.
+        kinds: the constructs that read all bytes.
     """
     if isinstance(con, kinds):
         return True
@@ -684,9 +637,9 @@ def to_public(parsed: Any) -> Any:
 def field_path(path: str | None) -> str:
     """Return a path of construct as a field path.
 
-    "(parsing) -> points[1] -> intensity" becomes "points[1].intensity". If a part has documentation
-    but no name, construct adds "None" to the path. This is removed.
+    "(parsing) -> points[1] -> intensity" becomes "points[1].intensity".
     """
+    # If a part has documentation but no name, construct adds "None" to the path.
     names = re.sub(r" -> None(?=$| ->|\[)", "", path or "").split(" -> ")[1:]
     return ".".join(names)
 
@@ -717,10 +670,7 @@ def iter_seals(con: Construct) -> Iterator[SealedStruct]:
 def iter_leaves(
     parsed: Any, keys: tuple[str | int, ...] = ()
 ) -> Iterator[tuple[tuple[str | int, ...], Any]]:
-    """Yield the values of a parsed object with the keys that lead to them.
-
-    Private entries are left out.
-    """
+    """Yield the values of a parsed object with the keys that lead to them."""
     if isinstance(parsed, dict):
         for name, value in parsed.items():
             if not name.startswith("_"):
@@ -749,9 +699,6 @@ def random_value(
     con: Construct, source: random.Random, drawn: Drawn, scope: Any = None, path: str = ""
 ) -> Any:
     """Return a random value that a construct can build.
-
-    The values are used for examples of frames with `Parts` or without a layout, because random
-    bytes are hardly ever such a frame.
 
     Args:
         source: the source of random numbers. If it has the methods `draw_number` and
@@ -840,11 +787,7 @@ def _draw_until(
 
 
 def _count_elements(con: Construct, scope: Any) -> int:
-    """Return the number of values in an element of an array.
-
-    An element that is an array of known length contains several values. All other elements count as
-    1.
-    """
+    """Return the number of values in an element of an array; 1 for a single value."""
     with contextlib.suppress(Exception):  # the count may depend on fields that are not drawn yet
         if isinstance(con, Array):
             return int(construct.evaluate(con.count, scope)) * _count_elements(con.subcon, scope)
@@ -870,10 +813,8 @@ def _draw_parts(
 
 
 def _draw_part(con: Construct, source: random.Random, drawn: Drawn, scope: Any, path: str) -> Any:
-    """Return a random part; try again if its values are invalid.
-
-    Without these attempts, frames with several counts would hardly ever have a part.
-    """
+    """Return a random part; try again if its values are invalid."""
+    # Without these attempts, frames with several counts would hardly ever have a part.
     for _ in range(MAX_DRAWS):
         with contextlib.suppress(Fault):
             return random_value(con, source, drawn, scope, path)
