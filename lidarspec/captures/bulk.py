@@ -54,7 +54,6 @@ class RecordKind:
     Attributes:
         start: offset of the payload in the record.
         size: length of the payload, bytes.
-        source: address and port of the sender.
         value: the first bytes of a record, as 64-bit words.
         mask: the bits of `value` that are equal in all records of the kind.
         trailer: the NumPy type of the length that is repeated at the end of a record; None if it is

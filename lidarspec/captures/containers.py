@@ -40,7 +40,6 @@ class Packing(NamedTuple):
     """A compression format.
 
     Attributes:
-        module: name of the Python module with the function `open` that decompresses.
         command: a shell command that decompresses a file; {} stands for the file.
     """
 
@@ -179,12 +178,7 @@ def find_damage(file: BinaryIO) -> Damage | None:
 
 
 def open_capture(path: str | os.PathLike[str], member: str = "") -> BinaryIO:
-    """Open a file for reading, and decompress a compressed file.
-
-    Raises:
-        SourceError: if the file cannot be opened or decompressed, or contains no capture.
-        UsageError: for an archive with several captures, or if a library is missing.
-    """
+    """Open a file for reading, and decompress a compressed file; see `unpack`."""
     with system_errors(os.fspath(path)), ExitStack() as undo:
         file = undo.enter_context(closing(open_stored(os.fspath(path))))
         content = unpack(os.fspath(path), file, member)

@@ -395,11 +395,7 @@ def _skip_extensions(protocol: int, body: bytes) -> tuple[int, int]:
 
 
 def _make_fragment(ident: int, *, start: int, size: int, more: bool) -> IpFragment | None:
-    """Return the fragment that header fields describe; None for a whole packet.
-
-    Raises:
-        NoDatagramError: for contradictory header fields.
-    """
+    """Return the fragment that header fields describe; None for a whole packet."""
     if not more and not start:
         return None
     is_cut_in_eights = not more or size % 8 == 0

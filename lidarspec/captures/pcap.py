@@ -79,17 +79,13 @@ class CaptureStats:
     """Counts of the contents of a capture that were read so far.
 
     Attributes:
-        packets: number of captured packets of all kinds.
-        datagrams: number of UDP datagrams that were returned.
         other: number of packets that are not UDP over IP.
         others: number of packets that are not UDP over IP, by protocol ("ARP", "TCP").
         unsupported: number of packets with an unsupported link layer, by link layer ("802.11").
         truncated_tail: whether the file ends within a record.
         snapped: number of UDP packets that were truncated by the snap length and not returned.
-        fragments: number of IP fragments of UDP packets.
         incomplete_fragments: number of fragments of datagrams that stayed incomplete.
         malformed: number of packets and records with contradictory fields.
-        damaged: number of records that could not be read.
         lost: number of bytes that were skipped because of damaged records.
         stopped_at: file offset of the record that ended the reading; None if the file was read to
             its end.
@@ -181,15 +177,10 @@ class CaptureReader(ClosingContext):
         return self._datagrams
 
     def skip_until(self, time_ns: int) -> bool:
-        """Skip datagrams that were captured before a time, if the file can seek.
-
-        Skipped datagrams are not counted.
+        """Skip datagrams before a time; return whether datagrams were skipped.
 
         Args:
             time_ns: ns since 1970.
-
-        Returns:
-            Whether datagrams were skipped.
         """
         return self._form is not None and seek_time(self._source, self._form, time_ns)
 

@@ -172,7 +172,6 @@ class PcapRecords:
 
     Attributes:
         sections: always 0; only pcapng files have sections.
-        order: the byte order of the file, as in `struct`.
     """
 
     sections = 0
@@ -310,7 +309,6 @@ class PcapngBlocks:
 
     Attributes:
         sections: number of sections that have begun.
-        order: the byte order of the current section, as in `struct`.
     """
 
     def __init__(self, source: BufferedInput) -> None:
@@ -568,7 +566,6 @@ def packet_record(data: bytes, at: int) -> bytes:
     """Return the pcap record of one packet.
 
     Args:
-        data: the packet, with its headers.
         at: capture time, ns since 1970.
 
     Raises:
@@ -591,11 +588,7 @@ def _refuse_size(data: bytes) -> None:
 
 
 def record_size(data: bytes | bytearray, at: int) -> int:
-    """Return the length of the record or file header at an offset.
-
-    Args:
-        data: a piece of a pcap file that this module wrote.
-    """
+    """Return the length of the record or file header at an offset."""
     if at == 0 and is_capture(bytes(data[:4])):
         return _HEAD.size
     return _RECORD.size + int.from_bytes(data[at + 8 : at + 12], "little")
@@ -605,7 +598,6 @@ class CaptureFormat(NamedTuple):
     """Functions that write captures of one format.
 
     Attributes:
-        head: returns the file header for a link type.
         record: returns the record for a packet and its time in ns since 1970.
         size: returns the length of the record or file header at an offset of a piece of the file.
     """

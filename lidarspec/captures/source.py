@@ -36,7 +36,6 @@ class BufferedInput:
     """A buffered reader of a file or pipe.
 
     Args:
-        file: the open file or pipe.
         largest: maximum size of the buffer in bytes, except for a longer record.
 
     Attributes:

@@ -54,7 +54,6 @@ class Diagnosis:
 
     Attributes:
         fix: the command that fixes the problem; "" if there is no command for it.
-        is_silence: whether the problem is that no data was received.
     """
 
     ok: bool
@@ -254,12 +253,7 @@ def _check_buffer() -> Iterator[Diagnosis]:
 def _check_interfaces(
     numbers: list[int], host: str, rates: dict[str, float]
 ) -> Iterator[Diagnosis]:
-    """Yield the possible reasons why no packet arrives at UDP ports.
-
-    Args:
-        host: the address of this computer in the SOURCE; "" if it has none.
-        rates: the received packets per second, by interface.
-    """
+    """Yield the possible reasons why no packet arrives at UDP ports."""
     listed = "/".join(map(str, numbers))
     active = {name: rate for name, rate in rates.items() if name != LOOPBACK and rate >= 1}
     if host:

@@ -384,9 +384,6 @@ class Score:
     """The rating of a sensor for some bytes.
 
     Attributes:
-        share: the share of the bytes that are in frames of the sensor.
-        data_frames: number of decoded data frames.
-        frames: all decoded frames.
         evidence: further evidence for this sensor; "" if there is none.
     """
 
@@ -432,11 +429,7 @@ class Verdict:
 
 
 def rate_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Score]:
-    """Return the scores of the sensors whose data frames are found, best first.
-
-    Args:
-        chunks: datagrams, or pieces of a stream.
-    """
+    """Return the scores of the sensors whose data frames are found, best first."""
     candidates = _list_sensors_with_frames()
     scores = _score_each(candidates, lambda sensor: _score(sensor, chunks, datagrams=datagrams))
     if not any(score.share >= FITTING_SHARE for score in scores):
@@ -526,11 +519,7 @@ def _score_each(
 def _score(
     sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool, sums: Sums | None = None
 ) -> Score | None:
-    """Return the score of a sensor; None if the bytes contain no data frame.
-
-    Args:
-        sums: computes checksums; None for the declared algorithms.
-    """
+    """Return the score of a sensor; None if the bytes contain no data frame."""
     if sensor.recognise is not None and datagrams and (options := sensor.recognise(tuple(chunks))):
         sensor = sensor.configure(**options)
     decoder = Decoder(sensor, stream=not datagrams, sums=sums)

@@ -23,13 +23,10 @@ class SampleBytes:
     """The bytes of one sender, and how they were received.
 
     Attributes:
-        source: the SOURCE of the bytes.
         chunks: datagrams, or pieces of a stream.
-        datagrams: whether `chunks` are datagrams.
         baud: the baud rate of a serial port; None if there is none.
         sender: the address of the sender; "" if the source has only one sender.
         failure: the error if the source could not be opened; else None.
-        warnings: warnings of the transport after reading.
         ports: the destination ports of the datagrams in a capture.
     """
 
@@ -68,7 +65,6 @@ def read_beginning(opened: Transport, enough: int, *, max_chunks: int | None = N
 
     Args:
         enough: the number of bytes after which reading ends.
-        max_chunks: maximum number of chunks; None for no limit.
     """
     return [
         replace(chunk, data=chunk.data[:enough])

@@ -36,9 +36,6 @@ class AsyncDevice:
     """A `Device` with awaitable methods; an asynchronous context manager.
 
     Its methods and properties have the arguments, results and errors of `Device`.
-
-    Args:
-        opening: the function that opens the device.
     """
 
     def __init__(self, opening: Callable[[], Device]) -> None:
@@ -191,9 +188,6 @@ class _ThreadedIterator(Generic[T]):
 
     Args:
         source: an iterator that yields None or an empty batch if nothing has arrived.
-
-    Attributes:
-        items: the items that the event loop has not taken yet.
     """
 
     def __init__(self, source: Iterator[Any]) -> None:

@@ -48,13 +48,7 @@ class BoundedQueue:
 
     Args:
         policy: what a full queue does: "drop_oldest" or "block".
-        chunks: maximum number of chunks.
         size: maximum total size of the chunks, in bytes.
-
-    Attributes:
-        produced: number of chunks that were put into the queue so far.
-        consumed: number of chunks that were taken.
-        dropped: number of chunks that were dropped.
     """
 
     def __init__(
@@ -171,13 +165,9 @@ class CaptureThread:
 
     Args:
         transport: the open transport. `close` closes it.
-        link: the name of the link.
         log: the recording; None to record nothing.
-        clock: the host's clock, for recorded events.
 
     Attributes:
-        connected: whether the device is connected.
-        disconnects: number of times that the device has disappeared.
         last_arrival: the time of `time.monotonic` when data last arrived, or when the transport was
             opened.
         warnings: warnings about the host's clock.
@@ -259,12 +249,7 @@ class CaptureThread:
             self._queue.put(self._link, [error])
 
     def _record_and_queue(self, chunks: list[Chunk], *, gap: bool, quiet: bool) -> None:
-        """Record and queue chunks.
-
-        Args:
-            gap: whether data is missing before the first chunk.
-            quiet: whether silence preceded the first chunk.
-        """
+        """Record and queue chunks."""
         if gap or quiet:
             chunks[0] = replace(chunks[0], gap=gap, quiet=quiet)
         self._check_wall_clock(chunks[0])
@@ -287,11 +272,7 @@ class CaptureThread:
             self._log.event("clock", chunk.at, ahead_ns=ahead)
 
     def _reconnect(self) -> bool:
-        """Report that the device has disappeared, and wait for its return.
-
-        Returns:
-            True if the device is back, False if the capture was stopped first.
-        """
+        """Wait until the device is back; return False if the capture was stopped first."""
         self.connected = False
         self.disconnects += 1
         self._queue_event(LinkEvent.LOST, "disconnect")

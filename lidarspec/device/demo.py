@@ -44,14 +44,10 @@ class Demonstration:
     Attributes:
         address: the SOURCE of the simulated sensor.
         error_share: the simulated share of lost datagrams, or of damaged bytes in a stream.
-        replies: the replies to the commands that started the sensor.
         scans: the received scans; the last scan is complete.
-        stats: the decoder's counters.
-        sent: number of packets that were sent.
         intact: number of packets that arrived without a simulated error.
         digest: SHA-256 of the points of the complete scans.
         recorded_digest: SHA-256 of the points of the complete scans in the recording.
-        recorded_bytes: size of the recording.
     """
 
     sensor: Sensor
@@ -73,7 +69,6 @@ def demonstrate(
     """Run a simulated sensor until a number of complete scans has arrived.
 
     Args:
-        scan_count: the number of complete scans.
         errors: the share of lost datagrams, or of damaged bytes in a stream.
         seed: the seed of the errors and the scene.
 

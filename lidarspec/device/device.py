@@ -545,11 +545,7 @@ class Device(ClosingContext):
             self._latest_stream = None
 
     def _take_batch_of_latest(self) -> FrameBatch | None:
-        """Return the batch with which an iterator begins after `latest`, or None.
-
-        Raises:
-            SourceError: if the file has been read to its end.
-        """
+        """Return the batch with which an iterator begins after `latest`, or None."""
         ahead = self._ahead
         self._ahead = None
         if ahead is not None:
@@ -601,11 +597,7 @@ class Device(ClosingContext):
 
 
 class _YieldTimer:
-    """Measures when an iterator has to yield although no data has arrived.
-
-    Args:
-        wait: maximum time between two yields, in seconds; None for no limit.
-    """
+    """Measures when an iterator has to yield although no data has arrived."""
 
     def __init__(self, wait: float | None) -> None:
         self._wait = wait

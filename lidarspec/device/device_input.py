@@ -39,7 +39,6 @@ class FrameBatch:
     """The frames in a portion of the input, in stream order.
 
     Attributes:
-        frames: the frames of all incoming types.
         interrupted: whether input is missing after these frames, so that no frame or scan
             continues.
         replaced: whether another sensor is read from now on, so that earlier frames are discarded.
@@ -56,8 +55,6 @@ class DeviceInput(Protocol):
     The methods of this class are for files. `LiveInput` overrides some of them.
 
     Attributes:
-        is_live: whether data arrives from a live source, not from a file.
-        decoder: finds the frames of the data link.
         stays_on: whether `close` leaves the sensor running.
         sensor: the sensor, configured with the `learned` options.
         info_frames: name in `Sensor.info` -> the last frame with this information.
@@ -121,13 +118,10 @@ class DeviceInput(Protocol):
         return None
 
     def skip_until(self, time_ns: int) -> bool:
-        """Skip data that arrived before a time, if the source can seek.
+        """Skip data that arrived before a time; return whether data was skipped.
 
         Args:
             time_ns: ns since 1970.
-
-        Returns:
-            Whether data was skipped.
         """
         return False
 
@@ -172,22 +166,10 @@ class DeviceInput(Protocol):
         return True
 
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
-        """Send a command from any thread, and return the reply.
-
-        Raises:
-            UnknownCommand, UnknownField, MissingField, OutOfRange: for an invalid command; nothing
-                is sent.
-            CommandError: if the device refuses, the connection is lost, or there is no device.
-            ReplyTimeout: if the device does not reply.
-        """
+        """Send a command from any thread, and return the reply."""
 
     def write(self, data: bytes, link: str = "data") -> None:
-        """Send bytes without interpreting them or waiting for a reply.
-
-        Raises:
-            UsageError: if `data` is a str, or if the sensor does not have the link.
-            SourceError: if the connection is lost, or there is no device.
-        """
+        """Send bytes without interpreting them or waiting for a reply."""
 
     def first_frames(self) -> FirstFrames:
         """Return the frames to use before the first packet; none for a live source."""
@@ -270,7 +252,6 @@ class FileInput(DeviceInput):
 
     Attributes:
         state: "streaming", "ended" or "closed".
-        senders: checks that all frames are from one sensor.
     """
 
     state = "streaming"

@@ -47,10 +47,6 @@ class FileScans(ClosingContext):
     Args:
         bookmark: the start, from `survey` for the same file and sensor; None for the start of the
             file.
-
-    Raises:
-        UsageError: for a source that is not a file, or a sensor without points.
-        SourceError: if the file cannot be read.
     """
 
     def __init__(self, source: str | Path, sensor: Sensor, bookmark: bytes | None = None) -> None:
@@ -183,12 +179,7 @@ def _find_constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], A
 def _name_parts(
     value: Any, name: tuple[Any, ...], names: dict[tuple[Any, ...], Any], seen: set[int]
 ) -> None:
-    """Store a value and its parts in `names`.
-
-    Args:
-        name: the attributes and keys that lead from the sensor to the value.
-        names: name -> object; modified.
-    """
+    """Store a value and its parts in `names`."""
     if isinstance(value, _PLAIN_TYPES) or id(value) in seen:
         return
     names[name] = value
@@ -267,7 +258,6 @@ def _take_states(table: Table | None, which: Any) -> StateOf:
     """Return a table without unused frames.
 
     Args:
-        table: frames that packets refer to.
         which: for each packet, the row of its frame in `table`; -1 for a packet without a frame.
 
     Returns:

@@ -63,11 +63,8 @@ class LiveInput(DeviceInput):
 
     Args:
         opened: the open transport of the data link.
-        backend: the backend that evaluates `points`: "auto", "numpy" or "jit".
-        policy: what happens if the queue is full, "drop_oldest" or "block"; see `BoundedQueue`.
         record: returns the recorder for the configured sensor, or None. The recorder gets all data
             that is sent or arrives.
-        will_begin: whether `begin` will be called.
         period: seconds between two decodings.
     """
 
@@ -367,11 +364,7 @@ class LiveInput(DeviceInput):
                 pending.result()
 
     def _decode_if_idle(self, pending: PendingReply | None = None) -> None:
-        """Run the decoders once, unless another thread runs them.
-
-        Args:
-            pending: a command that the caller waits for. If it is done, the decoders do not run.
-        """
+        """Run the decoders once, unless another thread runs them."""
         if not self._decoder_lock.acquire(timeout=MAX_PUMP_S / 5):
             return
         try:
@@ -564,11 +557,7 @@ class LiveInput(DeviceInput):
                 ]
 
     def _send_outgoing(self) -> LidarSpecError | None:
-        """Send the session's data; if this fails, fail the session's requests.
-
-        Returns:
-            The error; None if the data was sent.
-        """
+        """Send the session's data; if this fails, fail its requests and return the error."""
         failure: LidarSpecError | None = None
         for outgoing in self._session.take_outgoing():
             try:

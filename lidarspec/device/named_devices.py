@@ -51,7 +51,6 @@ class NamedDevice:
     """A device of a settings file.
 
     Attributes:
-        name: the name of the device.
         sensor: id, alias or path of a module; None to detect the sensor.
         mount: the pose of the sensor; None if not given.
         shadowed_file: another settings file with a device of the same name, which is ignored; "" if

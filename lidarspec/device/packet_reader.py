@@ -33,11 +33,9 @@ class PacketReader:
 
     Args:
         frame: the frame type; None for the data frame type that arrives first.
-        first: frames to use before the first packet.
 
     Attributes:
         last: the packets of the last batch with a known frame type; None if there was none.
-        imu_samples: the IMU samples of the last batch.
     """
 
     def __init__(
@@ -82,11 +80,7 @@ class PacketReader:
         return self.last
 
     def add_imu(self, batch: FrameBatch, packets: Packets | None) -> None:
-        """Read the IMU samples of a batch, and store them in `imu_samples`.
-
-        Args:
-            packets: the packets of the batch, which may contain IMU samples.
-        """
+        """Read the IMU samples of a batch, and store them in `imu_samples`."""
         if self._imu is None:
             return
         if batch.replaced:
@@ -108,7 +102,6 @@ class PacketReader:
         """Yield the scans that a batch completes; an interruption ends the last scan.
 
         Args:
-            stream: divides packets into scans.
             is_added: whether `add` was already called with `batch`.
         """
         packets = self.last

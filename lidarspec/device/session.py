@@ -242,7 +242,6 @@ class _PendingCommand:
 
     Attributes:
         data: the bytes of the command; values from earlier replies may be missing.
-        arguments: the arguments, with values that the session has added.
         timeout: time from the first sending to the failure of the command, ns.
         sent: the times of all sendings, ns.
         wrong: a description of the last frame with the type of the reply, but wrong values.
@@ -289,8 +288,6 @@ class _LinkQueue:
     """The requests of one link.
 
     Attributes:
-        queue: requests that were not sent yet.
-        current: the sent request that waits for its reply.
         late_replies: replies that may still arrive after their timeout.
         quiet_until: time until which nothing is sent, ns.
     """
@@ -323,7 +320,6 @@ class _Heartbeat:
 
     Attributes:
         due: the time of the next sending, ns.
-        pending: the reply to the last sending.
     """
 
     arguments: dict[str, Any]
@@ -338,7 +334,6 @@ class Session:
     falls silent. Without `idle`, a reply after an incomplete frame is not found.
 
     Attributes:
-        sensor: the sensor.
         started: whether the sensor was started, and not stopped since.
         late: number of replies that arrived after their timeout.
         unanswered: heartbeat commands without a reply, and their errors.
@@ -478,7 +473,6 @@ class Session:
         """Fail all requests and stop all heartbeats.
 
         Args:
-            reason: the text of the error.
             link: the link on which requests fail; None for all links.
         """
         for name in [
@@ -516,11 +510,7 @@ class Session:
         return filled
 
     def _fill_in_provided(self, request: _PendingCommand) -> None:
-        """Fill in the values that earlier replies have provided.
-
-        Raises:
-            CommandError: for a value that no reply has provided.
-        """
+        """Fill in the values that earlier replies have provided."""
         needed = request.command.needed - set(request.arguments)
         missing = needed - set(self.provided)
         if missing:
@@ -599,11 +589,7 @@ class Session:
             current.wrong = f"{item.frame} with {', '.join(differs)}"
 
     def _use_refusal(self, line: _LinkQueue, item: Found, values: Any, now: int) -> bool:
-        """Fail the oldest unanswered request if a frame is a refusal.
-
-        Returns:
-            Whether the frame is a refusal.
-        """
+        """Fail the oldest request if a frame is a refusal; return whether it is one."""
         # a refusal may not identify its request: assume the oldest that it does not contradict
         refused = next(
             (late for late in line.late_replies if late.expected.is_refusal(item.frame, values)),
@@ -644,7 +630,6 @@ class Session:
         """End the current request of a link, and expect its missing replies later.
 
         Args:
-            reply_count: number of replies that have arrived, 0 or 1.
             since: the time from which the device settles, ns.
         """
         line.current = None

@@ -47,9 +47,7 @@ def make_recorder(
 
     Args:
         source: the SOURCE, which is stored in the header.
-        target: the path of the new file.
         sensor: the sensor, or its id; None if unknown.
-        overwrite: whether the file may exist.
 
     Raises:
         UnknownFormat, UsageError, SourceError: the errors of `open_recorder`.
@@ -145,7 +143,6 @@ class SourceRecording:
     """Records everything that a source sends to one file.
 
     Args:
-        source: the SOURCE, as for `lidarspec.open`.
         target: an .lsr, .pcap, .pcapng or .bin file.
         sensor: the sensor; None to record raw bytes.
         seconds: the time limit, counted from the opening of a live source, or from the first
@@ -157,7 +154,6 @@ class SourceRecording:
         salvage: whether to continue after damaged parts, if the source is a recording.
 
     Attributes:
-        recorder: writes the file; None before the source is open.
         packets: number of data packets so far, or of datagrams if the sensor is unknown.
         elapsed: seconds since the source was opened. At the end, the duration of the recording in
             seconds, if it has arrival times.
@@ -334,13 +330,7 @@ class SourceRecording:
             self._end(log)
 
     def _open_log(self, source: Transport, sensor: Sensor | str | None) -> LimitedRecorder:
-        """Create the recorder of an open source, and start to measure `elapsed`.
-
-        Raises:
-            UsageError: if `count` is given but packets cannot be counted, or if `make_recorder`
-                raises it.
-            SourceError: if the file cannot be created.
-        """
+        """Create the recorder of an open source, and start to measure `elapsed`."""
         is_decoded = sensor is not None and isinstance(source, LiveTransport)
         can_count = source.datagrams or is_decoded
         if self._count is not None and not can_count:
@@ -360,9 +350,6 @@ class SourceRecording:
 
         Args:
             is_timed: whether the time limit applies.
-
-        Raises:
-            SourceError: if the recorder has failed.
         """
         assert self.recorder is not None
         if self.recorder.error is not None:

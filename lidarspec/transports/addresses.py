@@ -31,8 +31,6 @@ class SourceAddress:
     """The parts of a live SOURCE.
 
     Attributes:
-        text: the whole SOURCE.
-        scheme: "serial", "udp", "tcp" and so on.
         location: a path, or host and port.
         options: name -> value of the options after the question mark.
     """
@@ -47,7 +45,6 @@ class SourceAddress:
         """Return the parts of a live SOURCE.
 
         Args:
-            text: the SOURCE, such as "udp://:2368?src=10.0.0.5".
             scheme: the scheme; "" to take it from `text`.
         """
         if "://" in text:
@@ -144,7 +141,6 @@ def resolve_host(host: str, place: str) -> str:
     An IPv4 address is preferred to an IPv6 address.
 
     Args:
-        host: an address or a name.
         place: the option or SOURCE with the host, for the error message.
 
     Raises:

@@ -40,7 +40,6 @@ def make_replay_outlet(destination: str, *, datagrams: bool, port: int = 0) -> O
     Args:
         destination: "pty", "udp://HOST:PORT" or "tcp://HOST:PORT". TCP port 0 selects any free
             port. Without a UDP port, each datagram is sent to the recorded port.
-        datagrams: whether the recording contains datagrams.
         port: the port for datagrams that were recorded without a port.
 
     Raises:
@@ -137,10 +136,7 @@ def _make_control_lines(sensor: Sensor) -> dict[str, OutletLine]:
 
 
 def _make_control_line(link: Link) -> OutletLine | None:
-    """Return a line at the declared port or, if it is in use, at a free port.
-
-    Returns None for a link type of a plugin.
-    """
+    """Return a line at the declared port or, if it is in use, at a free port."""
     for port in (_find_declared_port(link), 0):
         with contextlib.suppress(OSError, SourceError):
             if isinstance(link, Tcp):

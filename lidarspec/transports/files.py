@@ -267,11 +267,7 @@ class HexTransport(FileTransport):
 
 
 class CaptureTransport(FileTransport):
-    """Reads the UDP datagrams of a pcap or pcapng file.
-
-    Attributes:
-        reader: the reader of the file; None before `chunks` or `batches` is called.
-    """
+    """Reads the UDP datagrams of a pcap or pcapng file."""
 
     datagrams = True
     in_batches: type[CaptureBatches] = CaptureBatches

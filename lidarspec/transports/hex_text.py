@@ -271,9 +271,6 @@ def _to_ns(seconds: str | None) -> int | None:
 def _parse_dump_bytes(text: str) -> bytes:
     """Return the bytes of a line of a dump.
 
-    Args:
-        text: the line without its offset.
-
     Raises:
         ValueError: if the characters in the line do not match its bytes.
     """
@@ -342,7 +339,6 @@ def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
     A line that is longer than `BLOCK_BYTES` is returned in several chunks.
 
     Args:
-        name: the name of the file, for messages.
         readline: returns the next line, or at most the given number of its bytes.
 
     Raises:

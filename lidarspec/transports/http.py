@@ -80,12 +80,7 @@ class HttpTransport(LiveTransport):
         self.closed = True
 
     def _send_request(self, method: str, path: str, body: bytes) -> tuple[int, bytes, str]:
-        """Send a request; return the status, body and redirection target of the reply.
-
-        Raises:
-            OSError, HTTPException: if the connection fails.
-            ValueError: for a reply that is too long or incomplete.
-        """
+        """Send a request; return the status, body and redirection target of the reply."""
         connection = http.client.HTTPConnection(
             self._host, self._link.port, timeout=self._link.timeout
         )

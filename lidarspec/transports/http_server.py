@@ -32,7 +32,6 @@ class HttpLine(OutletLine):
     """The web server of a simulated sensor.
 
     Args:
-        host: the address to listen on.
         port: the port to listen on; 0 selects any free port.
 
     Raises:

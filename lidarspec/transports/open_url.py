@@ -68,7 +68,6 @@ def open_live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport
     """Open the transport of a live SOURCE.
 
     Args:
-        source: a port, a URL, or the name of a device in `lidarspec.toml`.
         sensor: the sensor whose baud rate, control lines and ports are the defaults; None for no
             defaults.
 
@@ -128,7 +127,6 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
 
     Args:
         source: the SOURCE of the data. Its option ``control=HOST[:PORT]`` overrides `host`.
-        name: the name of the link.
         host: the sensor's address; None if it is unknown.
 
     Raises:

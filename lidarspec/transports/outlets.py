@@ -220,7 +220,6 @@ class UdpLine(OutletLine):
             ports: the destination ports. With several ports, each datagram is sent to the port of
                 its `receiver`.
             default_port: the destination port of datagrams without a receiver; 0 for none.
-            takes_commands: whether commands are sent to this line.
 
         Raises:
             SourceError: for an unknown host.
@@ -258,7 +257,6 @@ class UdpLine(OutletLine):
         The line also receives broadcasts of this computer.
 
         Args:
-            host: the address to listen on.
             port: the port to listen on; 0 selects any free port.
 
         Raises:
@@ -374,7 +372,6 @@ class TcpLine(OutletLine):
     A new connection receives only the bytes that are sent after it was opened.
 
     Args:
-        host: the address to listen on.
         port: the port to listen on; 0 selects any free port.
         sole: whether only one connection at a time is accepted.
         is_reported: whether the sensor reports its port, so that the SOURCE contains none.

@@ -26,7 +26,6 @@ class SerialPort:
 
     Attributes:
         path: the name of the port, such as "/dev/ttyUSB0" or "COM4".
-        description: the system's description of the device.
         lasting: a name of the port that does not depend on the USB socket; "" if there is none.
         allowed: whether the current user may open the port.
         users: the programs that have opened the port, if the system shows them.

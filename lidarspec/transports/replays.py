@@ -27,12 +27,7 @@ _MAX_REORDERING_NS = _SECOND_NS
 
 
 class Deadlines:
-    """Computes the deadline of each chunk of a replay, in ns of the monotonic clock.
-
-    Args:
-        speed: 2.0 is twice as fast as recorded; None is as fast as possible.
-        start: the deadline of the first chunk.
-    """
+    """Computes the deadline of each chunk of a replay, in ns of the monotonic clock."""
 
     def __init__(self, speed: float | None, start: int) -> None:
         self._speed = speed
@@ -71,7 +66,6 @@ def iter_paced(
     Args:
         speed: 2.0 is twice as fast as recorded; None is as fast as possible.
         now: returns the time, ns.
-        sleep: waits for a number of seconds.
     """
     deadlines: Deadlines | None = None
     for chunk in chunks:
@@ -97,8 +91,6 @@ class Replay:
         times: the range of arrival times to send, as for `Selection(times=...)`.
 
     Attributes:
-        chunks: number of chunks sent so far.
-        bytes: number of bytes sent so far.
         late: number of chunks that were sent more than 20 ms late.
         latest: the greatest delay of a chunk, ns.
         is_timed: whether the chunks of the file have times.

@@ -55,9 +55,6 @@ class LogKind(NamedTuple):
     """A kind of log, such as a ROS 1 bag.
 
     Attributes:
-        description: name of the kind, for messages.
-        module: name of the module of rosbags that reads the log.
-        reader: name of the class that reads the log, in `module`.
         form: the serialization format of the messages, "cdr" or "ros1".
     """
 

@@ -53,8 +53,6 @@ class SerialTransport(StreamTransport):
     """A serial port with 8 data bits, no parity and 1 stop bit.
 
     Args:
-        port: the name of the port, "/dev/ttyUSB0" or "COM4".
-        baud: the baud rate.
         dtr: level of the control line DTR while the port is open; None does not set it.
         rts: level of the control line RTS while the port is open; None does not set it.
         sensor: the sensor; None if unknown. Its longest frame determines when the line counts as

@@ -186,9 +186,6 @@ def _send_due(
     """Send the frames that are due.
 
     With an infinite rate, frames are sent as fast as they are read.
-
-    Args:
-        patient: whether to wait until the data is read.
     """
     is_unlimited = math.isinf(device.rate)
     if is_unlimited and not outlet.has_listener:
@@ -245,10 +242,6 @@ class Served(ClosingContext):
     Args:
         device: the simulated device.
         patient: whether to start the device only when a program listens.
-        clock: the clock of the device; None for real time.
-
-    Attributes:
-        device: the simulated device.
     """
 
     def __init__(
@@ -345,7 +338,6 @@ class Served(ClosingContext):
 
         Args:
             names: the names of all commands since the port was opened.
-            timeout: maximum wait in seconds.
 
         Raises:
             AssertionError: if other commands were received.

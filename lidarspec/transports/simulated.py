@@ -32,7 +32,6 @@ class SimulatedTransport(LiveTransport):
     Opening the data link starts the device. Reading the data link advances the time of the device.
 
     Args:
-        label: the SOURCE, for messages.
         data: the data link of the same device; None if this is the data link.
 
     Attributes:

@@ -232,14 +232,12 @@ class UdpTransport(LiveTransport):
     """Receives the datagrams that arrive on one or more ports.
 
     Args:
-        label: the SOURCE, for messages.
         ports: the ports to listen on; 0 for any free port.
         host: address of the interface; "" for all interfaces.
         group: multicast group to join; None to join no group.
         sender: accept only datagrams from this "HOST" or "HOST:PORT"; others are counted in
             `foreign`. None to accept all.
         datagrams: whether each datagram is a whole frame, not a portion of a byte stream.
-        sensor: the sensor, for suggested commands in messages.
         remote: the destination of `write`; by default `sender` with its port, or the sender that
             `accept` sets.
         broadcast: whether `remote` is a broadcast address, which `accept` replaces by the address
@@ -422,9 +420,6 @@ class UdpTransport(LiveTransport):
 class _Socket:
     """A socket and the statistics that the kernel reports for it.
 
-    Args:
-        slots: buffers to fetch many datagrams at once; None to fetch single datagrams.
-
     Attributes:
         buffer_bytes: size of the receive buffer, including the kernel's overhead.
         is_timed: whether the kernel records the arrival time of each datagram.
@@ -510,10 +505,6 @@ def _convert_time(seconds: int, nanoseconds: int, now: int, wall: int) -> int:
     """Convert a time of the wall clock to a time of the transport's clock.
 
     The result is at most `now`, and at least `now - MAX_KERNEL_DELAY_NS`.
-
-    Args:
-        now: the current time of the transport's clock, ns.
-        wall: the current wall-clock time, ns.
     """
     return now - min(max(wall - seconds * 1_000_000_000 - nanoseconds, 0), MAX_KERNEL_DELAY_NS)
 
@@ -591,12 +582,7 @@ def _find_command_address(address: SourceAddress, link: Udp) -> tuple[Sender | N
 
 
 def warn_of_small_buffer(requested: int, granted: int) -> list[str]:
-    """Return warnings if a receive buffer is smaller than requested.
-
-    Args:
-        requested: the requested size, in bytes.
-        granted: the size that the kernel granted, in bytes.
-    """
+    """Return warnings if a receive buffer is smaller than requested."""
     if granted >= requested:
         return []
     text = describe_small_buffer(requested, granted)
@@ -604,12 +590,7 @@ def warn_of_small_buffer(requested: int, granted: int) -> list[str]:
 
 
 def describe_small_buffer(requested: int, granted: int) -> str:
-    """Return a message about a receive buffer that is smaller than requested.
-
-    Args:
-        requested: the requested size, in bytes.
-        granted: the size that the kernel granted, in bytes.
-    """
+    """Return a message about a receive buffer that is smaller than requested."""
     return (
         f"the system granted a receive buffer of {granted >> 10} KiB instead of"
         f" {requested >> 10}: packets may be lost under load"

@@ -32,11 +32,7 @@ class AdapterKind:
     """A family of USB serial adapters.
 
     Attributes:
-        name: the name of the chips.
-        vendor_id: the USB id of the vendor.
-        product_ids: the USB ids of the products.
         module: the driver in the Linux kernel.
-        website: the page with the drivers for Windows and macOS.
         brltty: whether the program brltty mistakes the adapters for braille displays.
     """
 
