@@ -294,7 +294,7 @@ def datagram_record(datagram: Datagram) -> bytes:
 
 
 def datagram_frame(datagram: Datagram) -> bytes:
-    """Return one datagram as an Ethernet frame with IP and UDP headers, unfragmented.
+    """Return an unfragmented Ethernet frame that contains one datagram.
 
     Raises:
         UsageError: if the payload is too long, or an address or port is invalid.

@@ -149,7 +149,7 @@ def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
 
 
 def _find_excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
-    """Return related models that must have sent the frames instead of the sensor.
+    """Return the related models that sent packets which the sensor never sends.
 
     Returns:
         Id of the related model -> its difference from the sensor.

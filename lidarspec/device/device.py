@@ -545,7 +545,7 @@ class Device(ClosingContext):
             self._latest_stream = None
 
     def _take_batch_of_latest(self) -> FrameBatch | None:
-        """Return the batch with which an iterator begins after `latest`, or None."""
+        """Return the batch that a new iterator has to yield first, or None."""
         ahead = self._ahead
         self._ahead = None
         if ahead is not None:

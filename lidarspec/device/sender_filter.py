@@ -167,7 +167,11 @@ class SenderFilter(SenderCheck):
         return frames.select(np.array(mine, np.bool_))
 
     def _update_owner(self, sender: Sender, chunk: Chunk) -> bool:
-        """Select the sensor by the frames in a chunk; return True if it was replaced."""
+        """Update the selected sender by the frames in a chunk.
+
+        Returns:
+            Whether the new sender replaces another sender.
+        """
         owner = self._owner
         if (
             self._is_sure

@@ -123,7 +123,7 @@ def has_control(source: str | Path) -> bool:
 
 
 def control_link(source: str | Path, name: str, link: Link, host: str | None) -> LiveTransport:
-    """Open the transport of a link for commands without data.
+    """Open the transport of a link that carries commands, but no data.
 
     Args:
         source: the SOURCE of the data. Its option ``control=HOST[:PORT]`` overrides `host`.
