@@ -135,9 +135,7 @@ class IpPacket(NamedTuple):
     Attributes:
         source: address of the sender, 4 or 16 bytes.
         destination: address of the receiver, 4 or 16 bytes.
-        protocol: protocol number of the first header in `body`: UDP, or an extension header of
-            IPv6.
-        body: the bytes after the IP header.
+        protocol: number of the first header in `body`: UDP, or an IPv6 extension header.
         body_offset: offset of `body` in the frame; 0 for a reassembled packet.
         fragment: the position of the fragment; None for a whole packet.
         variable_offsets: offsets of the bytes of the IP header that differ between packets.
@@ -449,9 +447,6 @@ class Reassembly:
 
     A packet with overlapping fragments is dropped (RFC 5722). Incomplete packets are dropped after
     `TIMEOUT_NS`, or if they exceed `MAX_PACKETS` or `MAX_BYTES`.
-
-    Attributes:
-        dropped: the number of dropped fragments.
     """
 
     MAX_PACKETS = 256

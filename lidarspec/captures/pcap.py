@@ -79,9 +79,8 @@ class CaptureStats:
     """Counts of the contents of a capture that were read so far.
 
     Attributes:
-        other: number of packets that are not UDP over IP.
-        others: number of packets that are not UDP over IP, by protocol ("ARP", "TCP").
-        unsupported: number of packets with an unsupported link layer, by link layer ("802.11").
+        others: protocol, such as "ARP" -> number of packets that are not UDP over IP.
+        unsupported: unsupported link layer, such as "802.11" -> number of packets.
         truncated_tail: whether the file ends within a record.
         snapped: number of UDP packets that were truncated by the snap length and not returned.
         incomplete_fragments: number of fragments of datagrams that stayed incomplete.

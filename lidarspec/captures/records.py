@@ -80,7 +80,7 @@ class CapturedPacket(NamedTuple):
     """A captured frame.
 
     Attributes:
-        at: capture time in ns since 1970, in the range of int64; 0 if the record has no time.
+        at: ns since 1970, in the range of int64; 0 if the record has no time.
         original: length of the packet on the network, before truncation at the snap length.
     """
 
@@ -305,11 +305,7 @@ class Interface(NamedTuple):
 
 
 class PcapngBlocks:
-    """The blocks of a pcapng file.
-
-    Attributes:
-        sections: number of sections that have begun.
-    """
+    """The blocks of a pcapng file."""
 
     def __init__(self, source: BufferedInput) -> None:
         self._source = source

@@ -605,7 +605,6 @@ def identify_senders(
 
     Args:
         seconds: the time to listen at each baud rate.
-        on_progress: a function that is called with a description of the source before each attempt.
 
     Raises:
         SourceError: if the source cannot be opened.

@@ -165,12 +165,10 @@ class CaptureThread:
 
     Args:
         transport: the open transport. `close` closes it.
-        log: the recording; None to record nothing.
 
     Attributes:
         last_arrival: the time of `time.monotonic` when data last arrived, or when the transport was
             opened.
-        warnings: warnings about the host's clock.
     """
 
     def __init__(

@@ -42,9 +42,7 @@ class Demonstration:
     """The results of the demonstration.
 
     Attributes:
-        address: the SOURCE of the simulated sensor.
         error_share: the simulated share of lost datagrams, or of damaged bytes in a stream.
-        scans: the received scans; the last scan is complete.
         intact: number of packets that arrived without a simulated error.
         digest: SHA-256 of the points of the complete scans.
         recorded_digest: SHA-256 of the points of the complete scans in the recording.

@@ -55,7 +55,6 @@ class DeviceInput(Protocol):
     The methods of this class are for files. `LiveInput` overrides some of them.
 
     Attributes:
-        stays_on: whether `close` leaves the sensor running.
         sensor: the sensor, configured with the `learned` options.
         info_frames: name in `Sensor.info` -> the last frame with this information.
     """

@@ -126,7 +126,7 @@ def error_numbers(error: BaseException) -> list[int]:
 
 
 def find_data_link(sensor: Sensor | None, kind: type[L]) -> L | None:
-    """Return the data link of a sensor if it is of this kind, else None."""
+    """Return the data link of a sensor; None if it is not of class `kind`."""
     if sensor is not None:
         link = sensor.links.get("data")
     else:

@@ -121,7 +121,7 @@ class OutletLine:
         For links without connections, such as UDP, this returns at once.
 
         Returns:
-            Whether the program that listened before has disconnected by itself.
+            Whether the program that listened before has closed the port.
         """
         return False
 
@@ -179,7 +179,6 @@ class UdpLine(OutletLine):
     """Sends UDP datagrams to a host, or to the sender of the last command.
 
     Attributes:
-        takes_commands: whether the line receives commands.
         waits_for_address: whether datagrams are dropped until a command contains their destination.
     """
 
@@ -703,11 +702,7 @@ class Outlet:
         return self.data.unsent_bytes
 
     def receive(self, wait: float) -> list[tuple[str, bytes]]:
-        """Wait for commands on all links, and return (link, bytes) of each.
-
-        Args:
-            wait: maximum time, in seconds.
-        """
+        """Wait at most `wait` seconds for commands, and return (link, bytes) of each."""
         wait_for(self._lines.values(), wait)
         return [(name, data) for name, line in self._lines.items() for data in line.receive()]
 
@@ -755,11 +750,7 @@ class Outlet:
 
 
 def wait_for(lines: Collection[OutletLine], timeout: float) -> None:
-    """Wait until a line has input, or can send waiting bytes.
-
-    Args:
-        timeout: maximum time, in seconds.
-    """
+    """Wait at most `timeout` seconds for input, or until waiting bytes can be sent."""
     timeout = min([timeout, *(line.max_wait_s for line in lines)])
     reading = [descriptor for line in lines for descriptor in line.readable()]
     writing = [descriptor for line in lines for descriptor in line.writable()]

@@ -191,9 +191,6 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SerialTrans
 
     Examples are "serial:///dev/ttyUSB0?baud=230400&dtr=0", "/dev/ttyUSB0" and "COM4".
 
-    Args:
-        sensor: the sensor whose baud rate and control lines are the defaults; None for no defaults.
-
     Raises:
         UsageError: if the baud rate is unknown, or for an unknown option.
         SourceError: if the port cannot be opened.

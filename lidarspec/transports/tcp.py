@@ -141,9 +141,6 @@ class TcpTransport(StreamTransport):
 def connect(address: SourceAddress, sensor: Sensor | None = None) -> TcpTransport:
     """Open the connection of a TCP SOURCE: "tcp://192.168.1.200:2111".
 
-    Args:
-        sensor: the sensor whose port is the default; None for no default.
-
     Raises:
         UsageError: if host or port is missing, or for any option.
         SourceError: if the connection fails.

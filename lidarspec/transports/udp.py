@@ -8,8 +8,8 @@ Linux stores the arrival time of each datagram, and the number of datagrams that
 dropped. Arrival times are therefore exact, although the thread pauses after each read. The kernel
 may grant a smaller receive buffer than requested.
 
-`ReceiveSlots` fetches many datagrams with one system call, recvmmsg, because one call for each
-datagram is too slow for a fast sensor: each socket call in Python releases the interpreter lock.
+`ReceiveSlots` fetches many datagrams with one system call, recvmmsg. One call for each datagram
+would be too slow for a fast sensor, because each call releases the interpreter lock.
 """
 
 from __future__ import annotations
@@ -186,10 +186,7 @@ class ReceiveSlots:
         return data, sender
 
     def single_control_message(self, index: int) -> tuple[int, int, int] | None:
-        """Return (type, value, value) of a datagram's only control message, or None.
-
-        For datagrams with only an arrival time, this is faster than `control_messages`.
-        """
+        """Return (type, value, value) of a datagram's only control message, or None."""
         control_size = self._control_sizes[_CONTROL_SIZE_INDEX + index * _CONTROL_SIZE_STEP]
         if control_size != _CONTROL_WITH_TWO_INTEGERS.size:
             return None
@@ -514,9 +511,6 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
 
     Examples are "udp://", "udp://:2368" and
     "udp://?port=6699,7788&group=239.255.0.1&src=192.168.1.200".
-
-    Args:
-        sensor: the sensor whose ports are the default; None for no default.
 
     Raises:
         UsageError: if neither the SOURCE nor the sensor specifies a port, or for an unknown option.

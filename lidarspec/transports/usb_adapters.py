@@ -32,7 +32,6 @@ class AdapterKind:
     """A family of USB serial adapters.
 
     Attributes:
-        module: the driver in the Linux kernel.
         brltty: whether the program brltty mistakes the adapters for braille displays.
     """
 
