@@ -119,7 +119,7 @@ class PacketReader:
         return stream.add([])
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a bookmark (see `FileScans`), which is pickled."""
+        """Return the state for a bookmark; see `FileScans`."""
         return {**vars(self), "last": None, "imu_samples": join_samples([])}
 
     def _make_first_stream(self) -> PacketStream | None:

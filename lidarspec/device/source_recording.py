@@ -243,7 +243,7 @@ class SourceRecording:
             pass
 
     def _count_next(self, device: Device, log: LimitedRecorder) -> bool:
-        """Count recorded packets of the device; return False at their end."""
+        """Count the next recorded packets; return False if there are none."""
         arrived = _read_arrival_times(device)
         if len(arrived) == 0:
             return False
