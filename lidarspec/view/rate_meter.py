@@ -158,8 +158,9 @@ class RateTally:
         """Return the scans per second; None if unknown."""
         if not self._periods:
             return None
-        periods = np.array(self._periods)
-        median = np.median(periods)
+        periods = np.sort(self._periods)
+        # The lower of two middle values: a mean of both may be far from every period.
+        median = periods[(len(periods) - 1) // 2]
         is_usual = np.abs(periods - median) <= MAX_PERIOD_DEVIATION * median
         # Arrival times may be coarse, so the mean is more exact than the median.
         return float(1 / periods[is_usual].mean())

@@ -136,3 +136,14 @@ def test_the_speed_is_exact_for_coarse_arrival_times_and_ignores_lost_ends() -> 
         tally.add_scan(400, 390, 1000 / period_ms)
     found = tally.reading(Counters(), seconds=None, counts_losses=False)
     assert found.speed_hz == pytest.approx(15)
+
+
+@pytest.mark.parametrize("periods_s", [[0.1, 0.4], [0.4, 0.1] * 50])
+def test_half_of_the_scans_without_their_ends_do_not_change_the_speed(
+    periods_s: list[float],
+) -> None:
+    tally = RateTally(Counters())
+    for period_s in periods_s:
+        tally.add_scan(400, 390, 1 / period_s)
+    found = tally.reading(Counters(), seconds=None, counts_losses=False)
+    assert found.speed_hz == pytest.approx(10)
