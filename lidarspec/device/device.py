@@ -207,11 +207,11 @@ class Device(ClosingContext):
         for batch in self._iter_batches(wait, ahead):
             packets = None
             if batch is not None and batch is ahead and frame is None:
-                packets = reader.last
+                packets = reader.last_packets
             elif batch is not None:
-                packets = reader.add(batch)
+                packets = reader.read_packets(batch)
                 if frame is None:
-                    reader.add_imu(batch, packets)
+                    reader.read_imu(batch, packets)
             self.imu_samples = self._get_imu_samples(reader, batch)
             has_data = (packets is not None and len(packets)) or len(self.imu_samples)
             if has_data or batch is None or yield_timer.is_due():
@@ -242,7 +242,7 @@ class Device(ClosingContext):
             packets_by_frame = dict[str, Packets]()
             if batch is not None:
                 for frame, reader in readers.items():
-                    packets = reader.add(batch)
+                    packets = reader.read_packets(batch)
                     if packets is not None and len(packets):
                         packets_by_frame[frame] = packets
             if packets_by_frame or batch is None or yield_timer.is_due():
@@ -298,7 +298,7 @@ class Device(ClosingContext):
         yield_timer = _YieldTimer(wait)
         for batch in self._iter_batches(wait, ahead):
             if batch is not None and batch is not ahead:
-                reader.add_imu(batch, reader.add(batch))
+                reader.read_imu(batch, reader.read_packets(batch))
             if reader.waiting_imu is not None:
                 reader.waiting_imu.take_until(None)  # free memory: no scan uses them
             samples = self._get_imu_samples(reader, batch)
@@ -522,7 +522,7 @@ class Device(ClosingContext):
         stream = self._make_scan_stream()
         for batch in self._iter_batches(wait, ahead):
             if batch is not None:
-                for scan in reader.find_scans(stream, batch, is_added=batch is ahead):
+                for scan in reader.find_scans(stream, batch, is_read=batch is ahead):
                     yield scan
                     del scan  # only the caller may keep it alive
                     yield_timer.restart()

@@ -39,8 +39,8 @@ class FrameBatch:
     """The frames in a portion of the input, in stream order.
 
     Attributes:
-        interrupted: whether input is missing after these frames, so that no frame or scan
-            continues.
+        interrupted: whether input was lost after these frames, so that no frame or scan extends
+            into the next batch.
         replaced: whether another sensor is read from now on, so that earlier frames are discarded.
     """
 
@@ -52,10 +52,12 @@ class FrameBatch:
 class DeviceInput(Protocol):
     """The source of a device's frames.
 
-    The methods of this class are for files. `LiveInput` overrides some of them.
+    `FileInput` and `LiveInput` are its subclasses. The methods that this class implements are for
+    files, and `LiveInput` overrides some of them.
 
     Attributes:
-        sensor: the sensor, configured with the `learned` options.
+        sensor: the sensor, configured with the options in `learned`.
+        learned: the options that the sensor has reported in replies: name -> value.
         info_frames: name in `Sensor.info` -> the last frame with this information.
     """
 
@@ -67,7 +69,7 @@ class DeviceInput(Protocol):
     info_frames: Mapping[str, Found] = MappingProxyType({})
 
     def store_info_frames(self, batches: Sequence[Frames]) -> None:
-        """Store the last frame with the information of each name in `Sensor.info`."""
+        """For each name in `Sensor.info`, store the last frame with this information."""
         for frames in batches:
             for role, fact in self.sensor.reported.items():
                 for name in frames.names:
@@ -125,9 +127,12 @@ class DeviceInput(Protocol):
         return False
 
     def read_ahead(self, size: int) -> None:
-        """Set how many bytes of a file are read and decoded at a time; 0 for the fastest size.
+        """Set how many bytes of a file are read and decoded at a time.
 
-        For a live source, this has no effect.
+        For a live source, this method has no effect.
+
+        Args:
+            size: the number of bytes; 0 for the size with which a file is read fastest.
         """
 
     def delay_decoding(self, until: float) -> None:
@@ -141,8 +146,8 @@ class DeviceInput(Protocol):
         """Send the commands that the sensor declares for opening.
 
         Raises:
-            CommandError: if an opening command fails, unless the sensor can be read without a
-            reply.
+            CommandError: if an opening command fails. If data can be read without its reply, a
+                warning is added instead.
         """
 
     def next(self, wait: float) -> FrameBatch | None:
@@ -171,7 +176,7 @@ class DeviceInput(Protocol):
         """Send bytes without interpreting them or waiting for a reply."""
 
     def first_frames(self) -> FirstFrames:
-        """Return the frames to use before the first packet; none for a live source."""
+        """Return the frames that the first packets require; empty for a live source."""
         return FirstFrames()
 
     def close(self) -> None:
@@ -218,7 +223,7 @@ def _decode_stream(
 def _set_arrival(
     batches: Iterable[Frames], ends: NDArray[np.int64], times: NDArray[np.int64]
 ) -> list[Frames]:
-    """Return frames with the arrival times of their last bytes.
+    """Return the frames, each with the arrival time of its last byte.
 
     Args:
         ends: the end of each datagram, (n,) bytes from the start of the input.
@@ -330,10 +335,10 @@ class FileInput(DeviceInput):
         self._frame_batches = iter(())  # the old generator holds this object and the read data
 
     def first_frames(self) -> FirstFrames:
-        """Return the frames to use before the first packet of the file.
+        """Return the frames that are required to decode the first packets of the file.
 
-        The file is opened and read a second time. The result is empty if the sensor needs no such
-        frames, or if the source can be read only once.
+        The file is opened and read a second time. The result is empty if the sensor requires no
+        such frames, or if the source can be read only once.
         """
         path = Path(str(self._source).partition("?")[0])
         if not needs_first_frames(self.sensor) or not (

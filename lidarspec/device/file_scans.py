@@ -82,7 +82,7 @@ class FileScans(ClosingContext):
         return [*self._input.warnings, *self._added_warnings]
 
     def add_warnings(self, warnings: Iterable[str]) -> None:
-        """Add warnings about the scans that were read."""
+        """Add to `warnings`, for example warnings about the scans of the file."""
         self._added_warnings += warnings
 
     def __iter__(self) -> Iterator[Scan]:
@@ -97,8 +97,8 @@ class FileScans(ClosingContext):
             size: minimum size of the piece, in bytes.
 
         Returns:
-            The number of scans that begin in the piece, and the bookmark of the next piece; None at
-            the end of the file.
+            The number of scans that begin in the piece, and the bookmark of the next piece. The
+            bookmark is None if this was the last piece.
         """
         scan_count = 0
         end = self._offset + size
@@ -171,15 +171,21 @@ class FileScans(ClosingContext):
 def _find_constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
     """Return the objects to which a bookmark refers by name: name -> object."""
     constants = dict[tuple[Any, ...], Any]()
-    _name_parts(sensor, (), constants, set())
+    _assign_names(sensor, (), constants, set())
     codecs = {("codec", name): get_codec(frame) for name, frame in sensor.frames.items()}
     return {**constants, **codecs, ("framing",): decoder.framing}
 
 
-def _name_parts(
+def _assign_names(
     value: Any, name: tuple[Any, ...], names: dict[tuple[Any, ...], Any], seen: set[int]
 ) -> None:
-    """Store a value and its parts in `names`."""
+    """Give names to a value and all its parts, and store them in `names`.
+
+    Args:
+        name: the name of the value. The name of a part is this name and the key of the part.
+        names: name -> object, to which the names are added.
+        seen: the ids of the objects that have names.
+    """
     if isinstance(value, _PLAIN_TYPES) or id(value) in seen:
         return
     names[name] = value
@@ -192,7 +198,7 @@ def _name_parts(
     elif isinstance(value, tuple | list):
         parts = dict(enumerate(value))
     for key, part in parts.items():
-        _name_parts(part, (*name, key), names, seen)
+        _assign_names(part, (*name, key), names, seen)
 
 
 class _StatePickler(pickle.Pickler):
@@ -207,7 +213,7 @@ class _StatePickler(pickle.Pickler):
         self._frames = {id(get_codec(frame).schema): name for name, frame in sensor.frames.items()}
 
     def persistent_id(self, obj: Any) -> Any:
-        """Return the name of a constant; None for an object to pickle."""
+        """Return the name of an object in a bookmark; None if it is pickled itself."""
         name = self._names.get(id(obj))
         if name is None and isinstance(obj, Sensor):
             return ("clock", self._names[id(obj.clock)])
@@ -255,9 +261,10 @@ def _make_table(sensor: Sensor, frame: str, frames: list[bytes]) -> Table:
 
 
 def _take_states(table: Table | None, which: Any) -> StateOf:
-    """Return a table without unused frames.
+    """Return the state frames of packets, without frames that no packet uses.
 
     Args:
+        table: frames of one type that packets refer to, such as calibrations.
         which: for each packet, the row of its frame in `table`; -1 for a packet without a frame.
 
     Returns:

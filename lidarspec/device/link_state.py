@@ -52,13 +52,13 @@ class LinkState:
         )
         self.has_data = False
 
-    def record_senders(self, *, is_sensor: bool) -> None:
+    def record_arrival(self, *, from_sensor: bool) -> None:
         """Record that datagrams arrived.
 
         Args:
-            is_sensor: whether at least one of the datagrams is from the sensor.
+            from_sensor: whether at least one of the datagrams is from the sensor.
         """
-        if is_sensor:
+        if from_sensor:
             self._only_others_since = None
         elif self._only_others_since is None:
             self._only_others_since = time.monotonic()
@@ -84,7 +84,12 @@ class LinkState:
 
     @property
     def name(self) -> str:
-        """The state: "disconnected", "silent", "no frames", "waiting" or "streaming"."""
+        """The state of the link.
+
+        "disconnected"; "silent": nothing arrives from the sensor; "no frames": bytes arrive, but
+        they contain no frame; "waiting": no frame has arrived yet, but the link has no problem so
+        far; "streaming".
+        """
         if not self._capture.connected:
             return "disconnected"
         if self.silent_for > SILENT_AFTER_S:
@@ -102,7 +107,7 @@ class LinkState:
         if name == "disconnected":
             text = "the device is disconnected; waiting for it to return"
         elif name == "silent":
-            text = f"no data received{self._describe_others()} for {self.silent_for:.1f} s"
+            text = self._describe_silence()
         elif name == "no frames":
             text = f"received {self._frameless_bytes} bytes without a frame of {self._sensor.id}"
             if self._transport.baud:
@@ -125,15 +130,16 @@ class LinkState:
     def _other_sender(self) -> Sender | None:
         return self._senders.other_sender or self._transport.other_sender
 
-    def _describe_others(self) -> str:
-        """Return a clause about datagrams of other senders; "" if there are none."""
+    def _describe_silence(self) -> str:
+        """Return a text about a silent link, with the number of datagrams of other senders."""
+        seconds = f"{self.silent_for:.1f} s"
         other = self._other_sender
         if other is None:
-            return ""
+            return f"no data received for {seconds}"
         count = self._senders.foreign + self._transport.foreign
         return (
-            f" from the sensor, but {count} datagrams from other senders, such as"
-            f" {endpoint(other)},"
+            f"no data received from the sensor for {seconds}, but {count} datagrams from other"
+            f" senders, such as {endpoint(other)}"
         )
 
     @property

@@ -453,7 +453,7 @@ class LiveInput(DeviceInput):
         batches = decode_chunks(decoder, chunks)
         if not decoder.stream:
             senders = frame_senders(chunks, batches[0], decoder.stats.bytes_in)
-            batches = [self._senders.select_ports(senders, batches[0])]
+            batches = [self._senders.select_frames(senders, batches[0])]
         if self._senders.address is not None:
             self._captures["data"].transport.accept(self._senders.address)
         self._deliver("data", batches)
@@ -461,7 +461,7 @@ class LiveInput(DeviceInput):
     def _select_sensor_chunks(self, chunks: list[Chunk]) -> list[Chunk]:
         """Return the chunks that the sensor sent."""
         mine = self._senders.select(chunks)
-        self._link_state.record_senders(is_sensor=bool(mine))
+        self._link_state.record_arrival(from_sensor=bool(mine))
         if self._senders.has_changed:
             self.decoder.take_pending()
             self._ready.append(FrameBatch(interrupted=True, replaced=True))
@@ -522,7 +522,10 @@ class LiveInput(DeviceInput):
                 self._failure = error
 
     def _request_port_again(self) -> None:
-        """Repeat the opening commands, because a reply contains the port of the data."""
+        """Send the opening commands again, so that the sensor reports its data port.
+
+        After the connection was lost, the sensor may use another port.
+        """
         if time.monotonic() >= self._repeat_due_s:
             self._repeat_due_s = time.monotonic() + REPEAT_PAUSE_S
             self._restart_sensor()
@@ -557,7 +560,12 @@ class LiveInput(DeviceInput):
                 ]
 
     def _send_outgoing(self) -> LidarSpecError | None:
-        """Send the session's data; if this fails, fail its requests and return the error."""
+        """Send the data that the session has queued.
+
+        Returns:
+            The error if sending failed; None otherwise. After an error, all requests of the session
+            have failed.
+        """
         failure: LidarSpecError | None = None
         for outgoing in self._session.take_outgoing():
             try:

@@ -6,9 +6,10 @@
     mount = {x = 0.2, yaw_deg = 90, inverted = true}
     options = {calibration = "./angles.csv"}
 
-A name can be used instead of a SOURCE; a file called front is written as ``./front``. Two files are
-read: the file in the user's configuration directory, and the nearest file that the user owns in the
-working directory or above it (the project's file).
+A name can be given instead of a SOURCE. To read a file called front, give ``./front``.
+
+Two settings files are read: the file in the user's configuration directory, and the nearest file
+that the user owns in the working directory or above it (the project's file).
 
 A project may be untrusted. Its file cannot replace devices of the user's file. It can run Python or
 refer to paths outside the folder only if the user has allowed the folder. A mistake in a file
@@ -93,7 +94,11 @@ class NamedDevice:
         return configured
 
     def find_refusal(self) -> UsageError | None:
-        """Return an error if only a trusted file may declare the device, else None."""
+        """Return an error if the device is not allowed; None if it is allowed.
+
+        Some devices, for example with a sensor in a Python file, are allowed only in a trusted
+        file.
+        """
         if self.is_trusted:
             return None
         folder = Path(self.file).parent
@@ -126,11 +131,11 @@ class NamedDevice:
 
 
 def find_device(source: str | Path) -> NamedDevice | None:
-    """Return the device with this name; None for every other SOURCE.
+    """Return the device with the name `source`; None if there is no such device.
 
     Raises:
-        UsageError: for a mistake in the settings file, a device that is not allowed, or a word that
-            is neither a name nor a file.
+        UsageError: for a mistake in the settings file, or for a device that is not allowed. If
+            devices are declared, also for a word that is neither one of their names nor a file.
         SourceError: if the settings file cannot be read.
     """
     word = str(source)

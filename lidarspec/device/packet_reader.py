@@ -35,7 +35,8 @@ class PacketReader:
         frame: the frame type; None for the data frame type that arrives first.
 
     Attributes:
-        last: the packets of the last batch with a known frame type; None if there was none.
+        last_packets: the packets that `read_packets` returned last; None before.
+        imu_samples: the IMU samples of the last batch.
     """
 
     def __init__(
@@ -48,7 +49,7 @@ class PacketReader:
         self._undecided: deque[Frames] = deque(maxlen=_MAX_UNDECIDED_PIECES)
         self._stream = self._make_first_stream()
         self._imu = self._make_imu_stream()
-        self.last: Packets | None = None
+        self.last_packets: Packets | None = None
         self.imu_samples = join_samples([])
 
     @property
@@ -58,8 +59,8 @@ class PacketReader:
             return self._imu.waiting
         return None
 
-    def add(self, batch: FrameBatch) -> Packets | None:
-        """Return the packets in a batch of frames; None if their type is not known yet."""
+    def read_packets(self, batch: FrameBatch) -> Packets | None:
+        """Return the packets in the next batch; None if their type is not known yet."""
         if batch.replaced:  # another sensor is read from now on
             self._undecided.clear()
             self._stream = self._make_first_stream()
@@ -74,12 +75,12 @@ class PacketReader:
                 return None
             self._stream = self._make_stream(name)
             self._undecided.clear()
-        self.last = self._stream.add(frames)
+        self.last_packets = self._stream.add(frames)
         if batch.interrupted:
             self._stream.interrupt()
-        return self.last
+        return self.last_packets
 
-    def add_imu(self, batch: FrameBatch, packets: Packets | None) -> None:
+    def read_imu(self, batch: FrameBatch, packets: Packets | None) -> None:
         """Read the IMU samples of a batch, and store them in `imu_samples`."""
         if self._imu is None:
             return
@@ -97,17 +98,17 @@ class PacketReader:
             self._imu.interrupt()
 
     def find_scans(
-        self, stream: ScanStream, batch: FrameBatch, *, is_added: bool = False
+        self, stream: ScanStream, batch: FrameBatch, *, is_read: bool = False
     ) -> Iterator[Scan]:
         """Yield the scans that a batch completes; an interruption ends the last scan.
 
         Args:
-            is_added: whether `add` was already called with `batch`.
+            is_read: whether `read_packets` was already called with `batch`.
         """
-        packets = self.last
-        if not is_added:
-            packets = self.add(batch)
-            self.add_imu(batch, packets)
+        packets = self.last_packets
+        if not is_read:
+            packets = self.read_packets(batch)
+            self.read_imu(batch, packets)
         if packets is not None and len(packets):
             yield from iter_released(stream.add(packets))
         if batch.interrupted:
@@ -120,7 +121,7 @@ class PacketReader:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a bookmark; see `FileScans`."""
-        return {**vars(self), "last": None, "imu_samples": join_samples([])}
+        return {**vars(self), "last_packets": None, "imu_samples": join_samples([])}
 
     def _make_first_stream(self) -> PacketStream | None:
         """Return the stream of the chosen frame type; None if the type is not known yet."""

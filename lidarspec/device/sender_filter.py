@@ -33,7 +33,7 @@ class SenderCheck:
     def __init__(self, source: str | Path, sensor: Sensor) -> None:
         self._source = source
         self._sensor = sensor
-        self._owner: Sender | None = None
+        self._address: Sender | None = None  # of the sensor
         self._current: dict[str, Sender] = {}  # sender of each frame type
         self._previous: dict[str, dict[Sender, None]] = {}  # its earlier senders, oldest first
 
@@ -47,10 +47,10 @@ class SenderCheck:
             UsageError: if two sensors have sent frames.
         """
         for name, sender in sent:
-            self._owner = self._owner or sender
+            self._address = self._address or sender
             other = (
-                self._owner
-                if sender[0] != self._owner[0]
+                self._address
+                if sender[0] != self._address[0]
                 else self._find_concurrent_port(name, sender)
             )
             if other is not None:
@@ -110,25 +110,25 @@ class SenderFilter(SenderCheck):
     @property
     def address(self) -> Sender | None:
         """The address and port of the sensor; None until a frame has arrived."""
-        return self._owner
+        return self._address
 
     def configure(self, sensor: Sensor) -> None:
-        """Replace the sensor by the configured sensor."""
+        """Search for frames of a newly configured sensor from now on."""
         self._sensor = sensor
         self._probes.clear()
 
     def choose(self, sender: Sender) -> None:
-        """Store the sender that is the sensor, if the sensor was not identified before."""
-        self._owner = self._owner if self._is_sure else sender
+        """Select `sender` as the sensor, unless the sensor was identified before."""
+        self._address = self._address if self._is_sure else sender
         self._is_sure = True
 
     @property
     def warnings(self) -> list[str]:
         """The warnings about another sender that sends to the same port."""
-        if self.other_sender is None or self._owner is None:
+        if self.other_sender is None or self._address is None:
             return []
         text = (
-            f"{self._source}: reading data from {endpoint(self._owner)}, and ignoring data from"
+            f"{self._source}: reading data from {endpoint(self._address)}, and ignoring data from"
             f" {endpoint(self.other_sender)}"
         )
         other = quote(with_option(self._source, "src", endpoint(self.other_sender)))
@@ -139,7 +139,7 @@ class SenderFilter(SenderCheck):
         mine: list[Chunk] = []
         self.has_changed = False
         for chunk in chunks:
-            if chunk.sender is not None and self._update_owner(chunk.sender, chunk):
+            if chunk.sender is not None and self._update_address(chunk.sender, chunk):
                 self.has_changed = True
                 for earlier in mine:
                     self._count_foreign(earlier.sender)
@@ -150,14 +150,18 @@ class SenderFilter(SenderCheck):
                 self._count_foreign(chunk.sender)
         return mine
 
-    def select_ports(self, sent: Sequence[tuple[str, Sender]], frames: Frames) -> Frames:
-        """Return the frames from the ports of the sensor, and count the other frames."""
+    def select_frames(self, sent: Sequence[tuple[str, Sender]], frames: Frames) -> Frames:
+        """Return the frames from the ports of the sensor, and count the other frames.
+
+        Args:
+            sent: (frame type, sender) of the frames, as returned by `frame_senders`.
+        """
         count_before = len(self._other_senders)
         for name, sender in sent:
             if sender not in self._other_senders:
                 self._update_port(name, sender)
                 if self._sensor.frames[name].data:
-                    self._owner = sender
+                    self._address = sender
         if len(self._other_senders) == count_before or len(sent) < len(frames):
             return frames
         mine = [sender not in self._other_senders for _, sender in sent]
@@ -166,42 +170,46 @@ class SenderFilter(SenderCheck):
                 self._count_foreign(sender)
         return frames.select(np.array(mine, np.bool_))
 
-    def _update_owner(self, sender: Sender, chunk: Chunk) -> bool:
-        """Update the selected sender by the frames in a chunk.
+    def _update_address(self, sender: Sender, chunk: Chunk) -> bool:
+        """Examine the frames in a chunk; select its sender if it is probably the sensor.
 
         Returns:
             Whether the new sender replaces another sender.
         """
-        owner = self._owner
+        address = self._address
         if (
             self._is_sure
-            and owner is not None
-            and (self._datagrams or sender == owner or not self._may_be_same_device(sender, owner))
+            and address is not None
+            and (
+                self._datagrams
+                or sender == address
+                or not self._may_be_same_device(sender, address)
+            )
         ):
             return False
         names = self._find_frame_types(sender, chunk)
         if self._is_sure:
             if names:  # the stream comes from another port
                 self._update_port("", sender)
-                self._owner = sender
+                self._address = sender
             return False
         self._is_sure = any(self._sensor.frames[name].data for name in names)
-        if self._is_sure or (names and owner is None):
-            self._owner = self._current[""] = sender
-        current = owner or self._first
-        return current is not None and self._owner is not None and not self._is_sensor(current)
+        if self._is_sure or (names and address is None):
+            self._address = self._current[""] = sender
+        current = address or self._first
+        return current is not None and self._address is not None and not self._is_sensor(current)
 
     def _is_sensor(self, sender: Sender) -> bool:
-        if self._owner is None:
+        if self._address is None:
             self._first = self._first or (None if self._datagrams else sender)
             return self._first in (None, sender)
         if self._datagrams:
-            return self._may_be_same_device(sender, self._owner)
-        return sender == self._owner
+            return self._may_be_same_device(sender, self._address)
+        return sender == self._address
 
-    def _may_be_same_device(self, sender: Sender, owner: Sender) -> bool:
-        """Return whether `sender` and `owner` may be ports of the same device."""
-        return sender[0] == owner[0] and sender not in self._other_senders
+    def _may_be_same_device(self, sender: Sender, address: Sender) -> bool:
+        """Return whether `sender` and `address` may be ports of the same device."""
+        return sender[0] == address[0] and sender not in self._other_senders
 
     def _find_frame_types(self, sender: Sender, chunk: Chunk) -> set[str]:
         """Return the types of the frames that a datagram completes."""
@@ -227,10 +235,10 @@ class SenderFilter(SenderCheck):
 
 
 def frame_senders(chunks: Sequence[Chunk], frames: Frames, end: int) -> list[tuple[str, Sender]]:
-    """Return (frame type, sender) of each frame in some datagrams.
+    """Return the senders of the frames in some datagrams, as pairs (frame type, sender).
 
-    If all datagrams have one sender, each frame type is returned only once. If a sender is unknown,
-    the result is empty.
+    The result has one pair for each frame, or, if all datagrams have the same sender, one pair for
+    each frame type. If the sender of any datagram is unknown, the result is empty.
 
     Args:
         end: the end of the last datagram, in bytes since the start of the input.

@@ -53,7 +53,7 @@ class Reply:
 
     Attributes:
         command: the name of the command.
-        frame: the type of the frame; None if the sensor documents no reply.
+        frame: the frame type of the reply; None if the sensor sends no reply to this command.
         values: the fields of the frame as raw wire integers, as returned by `Sensor.parse`;
             ``reply["path"]`` is the physical value.
         confirmed: whether the device replied.
@@ -147,7 +147,8 @@ class ExpectedReply:
         tables: the fields of each possible reply: frame type -> path -> field.
         matches: the values that a reply must have: path -> value. Paths that its frame type does
             not have are ignored.
-        echoes: the values that both a reply and a refusal must have, like `matches`.
+        echoes: the values that both a reply and a refusal must have: path -> value. Missing paths
+            are ignored.
         refusal: the frame type of a refusal; None if the sensor sends no refusals.
     """
 
@@ -158,7 +159,7 @@ class ExpectedReply:
 
     @property
     def values(self) -> dict[str, Any]:
-        """The values that the reply must have: path -> value."""
+        """All values that the reply must have, from `matches` and `echoes`."""
         return {**self.matches, **self.echoes}
 
     def find_differences(self, frame: str, values: Any) -> list[str]:
@@ -336,7 +337,7 @@ class Session:
     Attributes:
         started: whether the sensor was started, and not stopped since.
         late: number of replies that arrived after their timeout.
-        unanswered: heartbeat commands without a reply, and their errors.
+        unanswered: name of a heartbeat command that has no reply -> the error of its last sending.
         host: the address of this computer as seen by the sensor; None if unknown.
         port: the port at which this computer expects the data; None if unknown.
         provided: name in `Command.provides` -> value from a reply.
@@ -373,7 +374,7 @@ class Session:
                 is sent.
         """
         if name in self.sensor.commands:
-            filled = {**self._fill_values(self.sensor.commands[name]), **arguments}
+            filled = {**self._make_own_values(self.sensor.commands[name]), **arguments}
         else:
             filled = arguments
         data = self.sensor.command(name, **filled)
@@ -492,8 +493,11 @@ class Session:
             for request in waiting:
                 request.pending.settle(CommandError(f"{self.sensor.id} {request.name}: {reason}"))
 
-    def _fill_values(self, command: Command) -> dict[str, Any]:
-        """Return running numbers, and the address and port of this computer."""
+    def _make_own_values(self, command: Command) -> dict[str, Any]:
+        """Return the values of a command that the session knows: path or name -> value.
+
+        These are running numbers, and the address and port of this computer.
+        """
         filled: dict[str, Any] = {}
         for path, value in command.filled.items():
             if isinstance(value, Count):
@@ -630,7 +634,7 @@ class Session:
         """End the current request of a link, and expect its missing replies later.
 
         Args:
-            since: the time from which the device settles, ns.
+            since: the start of the command's settling time, in which nothing is sent, ns.
         """
         line.current = None
         line.quiet_until = since + _to_ns(request.command.settle)

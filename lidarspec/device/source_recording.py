@@ -70,7 +70,7 @@ class LimitedRecorder:
     """A recorder with a time limit for arriving data.
 
     Args:
-        recorder: writes the file. `close` closes it.
+        recorder: the recorder that writes the file; `LimitedRecorder.close` closes it, too.
         seconds: the time limit, counted from the first arrival; None for no limit.
 
     Attributes:
@@ -95,8 +95,8 @@ class LimitedRecorder:
         return self._recorder.error
 
     @property
-    def seconds(self) -> float | None:
-        """The time from the first to the last recorded arrival; None if nothing has arrived."""
+    def duration(self) -> float | None:
+        """Seconds from the first to the last recorded arrival; None if nothing has arrived."""
         if self.first is None or self.last is None:
             return None
         return (self.last - self.first) / 1e9
@@ -140,7 +140,7 @@ class LimitedRecorder:
 
 
 class SourceRecording:
-    """Records everything that a source sends to one file.
+    """Records in one file everything that a source sends.
 
     Args:
         target: an .lsr, .pcap, .pcapng or .bin file.
@@ -181,7 +181,7 @@ class SourceRecording:
         self._salvage = salvage
         self.recorder: BackgroundWriter | None = None
         self.device: Device | None = None
-        self._log: LimitedRecorder | None = None
+        self._limited_recorder: LimitedRecorder | None = None
         self.packets = 0
         self.elapsed = 0.0
         self._began = 0.0
@@ -205,14 +205,14 @@ class SourceRecording:
         device_warnings = list[str]()  # kept for the case that decoding fails
         failures = list[str]()
         with Device(
-            self._source, sensor, start=self._start, record=RecorderFactory(self._open_log)
+            self._source, sensor, start=self._start, record=RecorderFactory(self._open_recorder)
         ) as self.device:
-            log = self._log
-            assert log is not None  # the device has called `_open_log`
+            recorder = self._limited_recorder
+            assert recorder is not None  # the device has called `_open_recorder`
             try:
-                while not self._is_finished(log):
+                while not self._is_finished(recorder):
                     try:
-                        self._count_next(self.device, log)
+                        self._count_next(self.device, recorder)
                         device_warnings = self.device.warnings
                     except SourceError:
                         raise
@@ -226,9 +226,9 @@ class SourceRecording:
                         time.sleep(CHECK_PERIOD_S)
                     yield "\n".join(self._take_new_warnings([*device_warnings, *failures]))
             finally:
-                self._end(log)
+                self._end(recorder)
                 with contextlib.suppress(Exception, SystemExit):
-                    self._count_remaining(self.device, log)
+                    self._count_remaining(self.device, recorder)
 
     def _take_new_warnings(self, warnings: Iterable[str]) -> list[str]:
         """Return the warnings that were not passed to the previous call."""
@@ -237,25 +237,25 @@ class SourceRecording:
         self._reported = set(by_text)
         return new_warnings
 
-    def _count_remaining(self, device: Device, log: LimitedRecorder) -> None:
+    def _count_remaining(self, device: Device, recorder: LimitedRecorder) -> None:
         """Count the packets that are in the file, but were not decoded yet."""
-        while self._count_next(device, log):
+        while self._count_next(device, recorder):
             pass
 
-    def _count_next(self, device: Device, log: LimitedRecorder) -> bool:
+    def _count_next(self, device: Device, recorder: LimitedRecorder) -> bool:
         """Count the next recorded packets; return False if there are none."""
         arrived = _read_arrival_times(device)
         if len(arrived) == 0:
             return False
-        count = int(np.count_nonzero(arrived <= (log.last or 0)))
+        count = int(np.count_nonzero(arrived <= (recorder.last or 0)))
         self.packets += count
         return count == len(arrived)
 
-    def _end(self, log: LimitedRecorder) -> None:
+    def _end(self, recorder: LimitedRecorder) -> None:
         """Ignore further arrivals, and set `elapsed` to the duration of the file."""
-        log.end()
-        if log.seconds is not None:
-            self.elapsed = log.seconds
+        recorder.end()
+        if recorder.duration is not None:
+            self.elapsed = recorder.duration
 
     def _record_undecoded(self) -> Generator[str, None, None]:
         """Record a live source whose sensor is unknown, or copy a file."""
@@ -266,24 +266,24 @@ class SourceRecording:
             source = open_transport(self._source, self._sensor)
         with (
             contextlib.closing(source),
-            contextlib.closing(self._open_log(source, self._sensor)) as log,
+            contextlib.closing(self._open_recorder(source, self._sensor)) as recorder,
         ):
             if isinstance(source, LiveTransport):
-                yield from self._record_live(source, log)
+                yield from self._record_live(source, recorder)
             else:
-                yield from self._copy(source, log)
+                yield from self._copy(source, recorder)
             yield from source.warnings
 
     def _record_live(
-        self, source: LiveTransport, log: LimitedRecorder
+        self, source: LiveTransport, recorder: LimitedRecorder
     ) -> Generator[str, None, None]:
         """Record in a separate thread, and count the recorded datagrams."""
         queue = BoundedQueue()
-        with contextlib.closing(CaptureThread(source, queue, log=log)) as capture:
+        with contextlib.closing(CaptureThread(source, queue, log=recorder)) as capture:
             try:
-                while not self._is_finished(log):
+                while not self._is_finished(recorder):
                     yield ""
-                    for event in self._count_queued(source, queue, log, CHECK_PERIOD_S):
+                    for event in self._count_queued(source, queue, recorder, CHECK_PERIOD_S):
                         if event is LinkEvent.LOST:
                             yield (
                                 f"{self._source}: the device is disconnected; waiting for it to"
@@ -292,45 +292,49 @@ class SourceRecording:
                         elif event is LinkEvent.BACK:
                             yield f"{self._source}: the device has returned"
             finally:
-                self._end(log)
-                self._count_queued(source, queue, log, 0.0)  # arrived before the end
+                self._end(recorder)
+                self._count_queued(source, queue, recorder, 0.0)  # arrived before the end
             yield from capture.warnings
 
     def _count_queued(
-        self, source: LiveTransport, queue: BoundedQueue, log: LimitedRecorder, wait: float
+        self, source: LiveTransport, queue: BoundedQueue, recorder: LimitedRecorder, wait: float
     ) -> list[LinkEvent]:
-        """Empty the queue and count the recorded datagrams; return all other events."""
+        """Take all items from the queue, count the recorded datagrams, and return the events.
+
+        Args:
+            wait: maximum time to wait for an item, in seconds.
+        """
         events = list[LinkEvent]()
         for _, item in queue.take(wait):
             if isinstance(item, BaseException):
                 raise item
             if isinstance(item, LinkEvent):
                 events.append(item)
-            elif source.datagrams and log.contains(item):
+            elif source.datagrams and recorder.contains(item):
                 self.packets += 1
         return events
 
-    def _copy(self, source: Transport, log: LimitedRecorder) -> Generator[str, None, None]:
+    def _copy(self, source: Transport, recorder: LimitedRecorder) -> Generator[str, None, None]:
         """Copy a file, or record standard input with the times of arrival."""
         clock = HostClock()
         assert self.recorder is not None
         try:
             for chunk in source.chunks():
-                if self._is_finished(log, is_timed=False):
+                if self._is_finished(recorder, is_timed=False):
                     return
                 yield ""
                 self.recorder.wait_for_room()
                 needs_time = chunk.at is None and self._source == "-"
-                log.write(replace(chunk, at=clock.now()) if needs_time else chunk)
-                if log.is_over:
+                recorder.write(replace(chunk, at=clock.now()) if needs_time else chunk)
+                if recorder.is_over:
                     return
                 if source.datagrams:
                     self.packets += 1
         finally:
-            self._end(log)
+            self._end(recorder)
 
-    def _open_log(self, source: Transport, sensor: Sensor | str | None) -> LimitedRecorder:
-        """Create the recorder of an open source, and start to measure `elapsed`."""
+    def _open_recorder(self, source: Transport, sensor: Sensor | str | None) -> LimitedRecorder:
+        """Create the recorder for an open source, and start to measure `elapsed`."""
         is_decoded = sensor is not None and isinstance(source, LiveTransport)
         can_count = source.datagrams or is_decoded
         if self._count is not None and not can_count:
@@ -341,11 +345,11 @@ class SourceRecording:
         self.recorder = make_recorder(
             source, self._source, self._target, sensor, overwrite=self._overwrite
         )
-        self._log = LimitedRecorder(self.recorder, self._seconds)
+        self._limited_recorder = LimitedRecorder(self.recorder, self._seconds)
         self._began = time.monotonic()
-        return self._log
+        return self._limited_recorder
 
-    def _is_finished(self, log: LimitedRecorder, *, is_timed: bool = True) -> bool:
+    def _is_finished(self, recorder: LimitedRecorder, *, is_timed: bool = True) -> bool:
         """Update `elapsed`, and return whether a limit is reached.
 
         Args:
@@ -358,7 +362,7 @@ class SourceRecording:
         is_late = (
             is_timed
             and self._seconds is not None
-            and (log.is_over or self.elapsed >= self._seconds)
+            and (recorder.is_over or self.elapsed >= self._seconds)
         )
         return is_late or (self._count is not None and self.packets >= self._count)
 
