@@ -15,7 +15,7 @@ from lidarspec.detect.sample_bytes import read_beginning
 from lidarspec.drafting.distribution import (
     DistributionNames,
     Link,
-    add_to_distribution,
+    make_added_files,
     make_draft_files,
     make_example_files,
     write_files,
@@ -104,7 +104,7 @@ def new(
     else:
         texts = _draft_files(names, link, capture)
     if folder.exists():
-        texts = add_to_distribution(folder, names, texts)
+        texts = make_added_files(folder, names, texts)
     write_files(folder, texts)
     for name in texts:
         say(str(folder / name))

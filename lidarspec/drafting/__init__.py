@@ -9,5 +9,5 @@ new plugin. Modules in reading order:
 * `periods`: finds frames, their lengths, and fields that rise from frame to frame.
 * `draft`: analyses unknown frames, and returns a `Draft`.
 * `draft_code`: writes the source of a sensor from a `Draft`.
-* `distribution`: makes the files of a new sensor's distribution.
+* `distribution`: makes the files of a Python distribution with the new sensor.
 """

@@ -99,7 +99,7 @@ class WordSum(Checksum):
 
 
 def _add_carry(total: Values) -> Values:
-    """Return the low 16 bits of sums plus their higher bits."""
+    """Add the bits above bit 15 of each sum to its low 16 bits."""
     return (total & np.uint64(0xFFFF)) + (total >> np.uint64(16))
 
 
@@ -216,15 +216,15 @@ def iter_plain_matches(
     samples: SampleFrames, is_possible_place: Callable[[ChecksumPlace], bool] = accept_any_place
 ) -> Iterator[ChecksumMatch]:
     """Yield the simple checksums that match, the widest first."""
-    few = samples.take_spread(SCREENING_FRAMES)
+    subset = samples.select_of_all_lengths(SCREENING_FRAMES)
     tried = 0
     has_sure = False
     for size, algorithms in ((4, (Sum(32),)), (2, _TWO_BYTE_CHECKSUMS), (1, (Xor(), Sum(8)))):
-        for place in filter(is_possible_place, few.iter_places(size)):
+        for place in filter(is_possible_place, subset.iter_places(size)):
             has_sure_sum = False
-            for algorithm, span in _iter_checksums(few, place, algorithms):
+            for algorithm, span in _iter_checksums(subset, place, algorithms):
                 tried += 1
-                for match in _iter_matches(samples, few, algorithm, place, span, tried):
+                for match in _iter_matches(samples, subset, algorithm, place, span, tried):
                     if match.is_sure:
                         has_sure = True
                         if not isinstance(match.algorithm, Xor | WordXor):
@@ -256,7 +256,7 @@ def _iter_checksums(
 
 def _iter_matches(
     samples: SampleFrames,
-    few: SampleFrames,
+    subset: SampleFrames,
     algorithm: Checksum,
     place: ChecksumPlace,
     span: CoveredSpan,
@@ -265,14 +265,14 @@ def _iter_matches(
     """Yield the matches of an algorithm, alone and combined with a constant.
 
     Args:
-        few: some of the frames, on which the algorithm is tried first.
+        subset: some of the frames, on which the algorithm is tried first.
         tried: number of checksums tried so far; it reduces the certainty of a match.
     """
-    computed = few.compute_checksums(algorithm, place, span)
+    computed = subset.compute_checksums(algorithm, place, span)
     byte_orders: tuple[ByteOrder, ...] = ("little", "big") if place.size > 1 else ("little",)
     max_value = (1 << 8 * place.size) - 1
     for order in byte_orders:
-        stored = few.read_field(place, order)
+        stored = subset.read_field(place, order)
         for variant in _list_variants(algorithm, computed, stored, max_value):
             constant = variant.constant if isinstance(variant, ChecksumWithConstant) else 0
             has_constant = constant not in (0, max_value)
@@ -280,7 +280,7 @@ def _iter_matches(
             evidence_bits = weigh_evidence(variant.width, stored, int(has_constant), tried)
             if has_constant:
                 min_count = MIN_VALID_SHARE_WITH_CONSTANT * len(samples)
-                is_proven = valid_count >= min_count and not few.is_single
+                is_proven = valid_count >= min_count and not subset.is_single
             else:
                 is_proven = are_enough(valid_count, len(samples))
             if not is_proven or evidence_bits <= 0:
@@ -309,7 +309,9 @@ def _iter_matches(
 def _list_variants(
     algorithm: Checksum, computed: Values, stored: Values, max_value: int
 ) -> list[Checksum]:
-    """Return an algorithm with each constant that makes most frames valid.
+    """Return the variants of an algorithm that make most frames valid.
+
+    A variant is the algorithm alone, or combined with a constant.
 
     Args:
         computed: the result of the algorithm for each frame, (n,).

@@ -76,7 +76,7 @@ def remainder(a: int, b: int) -> int:
 
 
 def quotient(a: int, b: int) -> int:
-    """Return the quotient of polynomials a and b without remainder; b must not be 0."""
+    """Return polynomial a divided by b, without the remainder; b must not be 0."""
     size = b.bit_length()
     result = 0
     while (shift := a.bit_length() - size) >= 0:
@@ -233,7 +233,7 @@ def iter_crc_matches(
     else:
         mirrors = [(False, False), (True, True)]
     picks = [
-        samples.take_similar(FRAMES_PER_PICK, pick)
+        samples.select_of_usual_length(FRAMES_PER_PICK, pick)
         for pick in range(MAX_PICKS if len(samples) > 2 * FRAMES_PER_PICK else 1)
     ]
     by_width = [
@@ -252,21 +252,23 @@ def iter_crc_matches(
     ):
         width = 8 * place.size
         byte_orders: tuple[ByteOrder, ...] = ("little", "big") if width > 8 else ("little",)
-        readings = [_BitOrder(width, order, *mirror) for order in byte_orders for mirror in mirrors]
-        for span, reading in product(iter_spans(place, samples), readings):
+        bit_orders = [
+            _BitOrder(width, order, *mirror) for order in byte_orders for mirror in mirrors
+        ]
+        for span, bit_order in product(iter_spans(place, samples), bit_orders):
             tried += 1
             at_end = place.offset == -place.size
             by_catalogue = samples.shortest > MAX_DIVIDED_BYTES and (quick or not at_end)
             chosen = picks if at_end and span.covers_all else picks[:1]
             work_left -= sum(
-                _estimate_cost(pick, reading, by_catalogue=by_catalogue) for pick in chosen
+                _estimate_cost(pick, bit_order, by_catalogue=by_catalogue) for pick in chosen
             )
             if work_left < 0:
                 return
             results = (
                 list(
                     _iter_matches(
-                        samples, pick, place, span, reading, tried, by_catalogue=by_catalogue
+                        samples, pick, place, span, bit_order, tried, by_catalogue=by_catalogue
                     )
                 )
                 for pick in chosen
@@ -278,11 +280,11 @@ def iter_crc_matches(
             return
 
 
-def _estimate_cost(few: SampleFrames, reading: _BitOrder, *, by_catalogue: bool) -> int:
+def _estimate_cost(subset: SampleFrames, bit_order: _BitOrder, *, by_catalogue: bool) -> int:
     """Return the estimated work of a search, in bytes of CRC computation."""
     if by_catalogue:
-        return few.shortest * len(reading.catalogue_crcs())
-    return DIVISION_WORK * sum(map(len, few.frames))
+        return subset.shortest * len(bit_order.catalogue_crcs())
+    return DIVISION_WORK * sum(map(len, subset.frames))
 
 
 def _varies_like_crc(samples: SampleFrames, place: ChecksumPlace) -> bool:
@@ -298,22 +300,22 @@ def _varies_like_crc(samples: SampleFrames, place: ChecksumPlace) -> bool:
 
 
 def _make_codewords(
-    samples: SampleFrames, place: ChecksumPlace, span: CoveredSpan, reading: _BitOrder
+    samples: SampleFrames, place: ChecksumPlace, span: CoveredSpan, bit_order: _BitOrder
 ) -> Codewords:
     rows = [row.tobytes() for group in samples.cut_span(place, span) for row in group]
-    stored = samples.read_field(place, reading.order).tolist()
+    stored = samples.read_field(place, bit_order.order).tolist()
     return [
-        (len(row), reading.message(row) ^ reading.register(value))
+        (len(row), bit_order.message(row) ^ bit_order.register(value))
         for row, value in zip(rows, stored, strict=True)
     ]
 
 
 def _iter_matches(
     samples: SampleFrames,
-    few: SampleFrames,
+    subset: SampleFrames,
     place: ChecksumPlace,
     span: CoveredSpan,
-    reading: _BitOrder,
+    bit_order: _BitOrder,
     tried: int,
     *,
     by_catalogue: bool,
@@ -321,16 +323,18 @@ def _iter_matches(
     """Yield the CRCs that match for one place, one span and one bit order.
 
     Args:
-        few: the frames from which candidates are calculated.
+        subset: the frames from which candidates are calculated.
+        bit_order: the bit order of the CRC.
+        tried: number of checksums tried so far; it reduces the certainty of a match.
         by_catalogue: whether to try only the CRCs of the catalogue.
     """
-    stored = samples.read_field(place, reading.order)
+    stored = samples.read_field(place, bit_order.order)
     if by_catalogue:
-        candidates = _iter_catalogue(few, place, span, reading)
+        candidates = _iter_catalogue(subset, place, span, bit_order)
     else:
-        candidates = _iter_candidates(_make_codewords(few, place, span, reading), reading)
+        candidates = _iter_candidates(_make_codewords(subset, place, span, bit_order), bit_order)
     for crc, fitted, notes in candidates:
-        right = samples.count_valid(crc, place, span, reading.order)
+        right = samples.count_valid(crc, place, span, bit_order.order)
         is_known = crc.poly in KNOWN_POLYNOMIALS[crc.width]
         # An unknown polynomial is an additional fitted parameter. A known polynomial is one of many
         # that were tried.
@@ -342,7 +346,7 @@ def _iter_matches(
                 crc,
                 place,
                 span,
-                reading.order,
+                bit_order.order,
                 right,
                 len(samples),
                 evidence_bits,
@@ -354,7 +358,7 @@ def _iter_matches(
 
 
 def _iter_candidates(
-    words: Codewords, reading: _BitOrder
+    words: Codewords, bit_order: _BitOrder
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
     """Yield candidate CRCs.
 
@@ -362,34 +366,34 @@ def _iter_candidates(
         A CRC, the number of frames from which it was calculated, and notes about ambiguous
         parameters.
     """
-    ones = (1 << reading.width) - 1
+    ones = (1 << bit_order.width) - 1
     lengths = {size for size, _ in words}
     differences = _find_differences(words)
     if len(differences) >= 2:
-        for poly in _find_polynomials(differences, reading.width):
-            yield from _iter_crcs(words, poly, reading, has_one_length=len(lengths) == 1)
+        for poly in _find_polynomials(differences, bit_order.width):
+            yield from _iter_crcs(words, poly, bit_order, has_one_length=len(lengths) == 1)
         return
     for init, xorout in product((0, ones), repeat=2):
         absolute = [
-            word ^ reading.init_term(init, size) ^ xorout
+            word ^ bit_order.init_term(init, size) ^ xorout
             for size, word in words
-            if 8 * size >= reading.width
+            if 8 * size >= bit_order.width
         ]
         if len(absolute) < 2:
             continue
-        for poly in _find_polynomials(absolute, reading.width):
-            yield reading.crc(poly, init, xorout), 0, ()
+        for poly in _find_polynomials(absolute, bit_order.width):
+            yield bit_order.crc(poly, init, xorout), 0, ()
     if len(words) == 1:
-        yield from ((crc, 0, ()) for crc in reading.catalogue_crcs())
+        yield from ((crc, 0, ()) for crc in bit_order.catalogue_crcs())
 
 
 def _iter_catalogue(
-    few: SampleFrames, place: ChecksumPlace, span: CoveredSpan, reading: _BitOrder
+    subset: SampleFrames, place: ChecksumPlace, span: CoveredSpan, bit_order: _BitOrder
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
     """Yield the CRCs of the catalogue that are valid for the first frame."""
-    covered = few.cut_span(place, span)[0][0].tobytes()
-    stored = int(few.read_field(place, reading.order)[0])
-    yield from ((crc, 0, ()) for crc in reading.catalogue_crcs() if crc(covered) == stored)
+    covered = subset.cut_span(place, span)[0][0].tobytes()
+    stored = int(subset.read_field(place, bit_order.order)[0])
+    yield from ((crc, 0, ()) for crc in bit_order.catalogue_crcs() if crc(covered) == stored)
 
 
 def _find_differences(words: Codewords) -> list[int]:
@@ -413,29 +417,29 @@ def _find_polynomials(multiples: Sequence[int], width: int) -> list[int]:
 
 
 def _iter_crcs(
-    words: Codewords, poly: int, reading: _BitOrder, *, has_one_length: bool
+    words: Codewords, poly: int, bit_order: _BitOrder, *, has_one_length: bool
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
-    """Yield the likeliest CRC with a given polynomial.
+    """Yield the likeliest CRC with a given polynomial; nothing if no CRC fits.
 
     Args:
         has_one_length: whether all frames have the same length.
     """
     first = dict(reversed(words))  # the first frame of each length
     remainders = {size: remainder(word, poly) for size, word in first.items()}
-    ones = (1 << reading.width) - 1
+    ones = (1 << bit_order.width) - 1
     usual = [
         crc.init
         for crc in CRCS.values()
-        if (crc.width, crc.refin, crc.poly) == (reading.width, reading.refin, poly & ones)
+        if (crc.width, crc.refin, crc.poly) == (bit_order.width, bit_order.refin, poly & ones)
     ]
     consistent = []
     for init in dict.fromkeys((*usual, 0, ones)):
         finals = {
-            rest ^ remainder(reading.init_term(init, size), poly)
+            rest ^ remainder(bit_order.init_term(init, size), poly)
             for size, rest in remainders.items()
         }
         if len(finals) == 1:
-            consistent.append(reading.crc(poly, init, finals.pop()))
+            consistent.append(bit_order.crc(poly, init, finals.pop()))
     plain = [crc for crc in consistent if name_of(crc)] + [
         crc for crc in consistent if crc.xorout in (0, ones)
     ]
@@ -455,23 +459,27 @@ def _iter_crcs(
     elif consistent:
         yield consistent[0], 2, ()
     elif len(remainders) > 1:
-        yield from _solve_registers(remainders, poly, reading)
+        yield from _solve_registers(remainders, poly, bit_order)
 
 
 def _solve_registers(
-    remainders: dict[int, int], poly: int, reading: _BitOrder
+    remainders: dict[int, int], poly: int, bit_order: _BitOrder
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
-    """Yield the CRC of frames that have several lengths.
+    """Yield the CRC whose start value and final XOR fit frames of several lengths.
+
+    Yields nothing if no such values exist.
 
     Args:
         remainders: for each length, the remainder of a frame of this length modulo `poly`.
     """
     (size, rest), *others = remainders.items()
     equations = []
-    bits = range(reading.width)
+    bits = range(bit_order.width)
     for other, other_rest in others:
         columns = [
-            remainder(reading.init_term(1 << bit, size) ^ reading.init_term(1 << bit, other), poly)
+            remainder(
+                bit_order.init_term(1 << bit, size) ^ bit_order.init_term(1 << bit, other), poly
+            )
             for bit in bits
         ]
         difference = rest ^ other_rest
@@ -479,7 +487,7 @@ def _solve_registers(
             (sum((columns[bit] >> row & 1) << bit for bit in bits), difference >> row & 1)
             for row in bits
         ]
-    solution = solve(equations, reading.width)
+    solution = solve(equations, bit_order.width)
     if solution is not None:
         first, free = solution
         basis = free[:4]  # enough solutions to find a usual one among them
@@ -487,14 +495,14 @@ def _solve_registers(
             subset for count in range(1 + len(basis)) for subset in combinations(basis, count)
         )
         inits = [functools.reduce(operator.xor, subset, first) for subset in subsets]
-        pairs = [(init, rest ^ remainder(reading.init_term(init, size), poly)) for init in inits]
+        pairs = [(init, rest ^ remainder(bit_order.init_term(init, size), poly)) for init in inits]
         init, xorout = min(
-            pairs, key=lambda pair: (pair[1] not in (0, (1 << reading.width) - 1), pair[0])
+            pairs, key=lambda pair: (pair[1] not in (0, (1 << bit_order.width) - 1), pair[0])
         )
         notes: tuple[str, ...] = ()
         if free:
             notes = (f"{2 ** len(free)} pairs of init and xorout fit these frames equally well",)
-        yield reading.crc(poly, init, xorout), 2, notes
+        yield bit_order.crc(poly, init, xorout), 2, notes
 
 
 def format_crc(crc: Crc) -> str:

@@ -178,13 +178,14 @@ def fill_template(template: str, values: Mapping[str, str], link: Link) -> str:
     return Template(text_for_link).substitute(values)
 
 
-def add_to_distribution(
+def make_added_files(
     folder: Path, names: DistributionNames, texts: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the new and changed files that add a sensor to an existing distribution.
+    """Return the new and changed files of a distribution to which a sensor is added.
 
     Args:
-        texts: the files of a distribution with only this sensor.
+        folder: the folder of the existing distribution.
+        texts: the files of a distribution with only this sensor: path -> text.
 
     Raises:
         UsageError: if the folder has another distribution, or already has a file of this sensor.

@@ -82,16 +82,16 @@ class Draft:
 
     Attributes:
         sync: the first bytes of every frame.
-        size: the length of the frames, in bytes; None if it varies.
-        length: the length field; None if all frames have one length.
+        size: the size of the frames, in bytes; None if it varies.
+        length: the length field; None if all frames have one size.
         frames: (offset, bytes) of each frame that has all known properties.
         bytes_in: number of input bytes.
         rising_fields: the fields with rising values, except those in the blocks.
         blocks: repeated blocks of a frame; None if a frame has no blocks.
         checksum: the checksum; None if none was found.
         others: further checksums that match the frames.
-        common_bytes: the number of bytes at the start of a frame in which fields are searched; 0 if
-            the length field does not count bytes.
+        common_bytes: if the length field counts bytes, the number of bytes at the start of every
+            frame in which fields are searched; otherwise 0.
     """
 
     datagrams: bool
@@ -163,7 +163,7 @@ def make_draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
         bytes_in=sum(map(len, chunks)),
     )
     draft = replace(draft, frames=tuple(_iter_frames(draft, parts)))
-    draft = _find_count(draft, parts[0])
+    draft = _find_count_field(draft, parts[0])
     draft = _find_common_bytes(draft, parts)
     draft = replace(draft, rising_fields=tuple(find_rising_fields(draft.rows)))
     checksums = _find_checksums(draft)
@@ -252,9 +252,12 @@ def _has_valid_checksum(checksum: ChecksumMatch, frame: bytes) -> bool:
     return checksum.algorithm(covered) == stored
 
 
-def _find_count(draft: Draft, stream: bytes) -> Draft:
-    """Return the draft with a length field found from an incomplete last frame."""
-    # a byte is probably a number of elements if only the incomplete frame has another value
+def _find_count_field(draft: Draft, stream: bytes) -> Draft:
+    """Return the draft with the field that counts the elements of a frame, if it is found.
+
+    The stream ends in an incomplete frame. If all frames before it have the same value in a byte,
+    but the incomplete frame has another value, this byte is probably the number of elements.
+    """
     if draft.size is None or draft.datagrams or not draft.frames:
         return draft
     last_start, last_whole = draft.frames[-1]
@@ -294,7 +297,7 @@ def _find_count(draft: Draft, stream: bytes) -> Draft:
 
 
 def _find_common_bytes(draft: Draft, parts: Sequence[bytes]) -> Draft:
-    """Return the draft with `common_bytes`, without frames that are shorter."""
+    """Return the draft with `common_bytes`, without frames shorter than this number."""
     if draft.length is None or not draft.frames:
         return draft
     if draft.length.unit > 1:

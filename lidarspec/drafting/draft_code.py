@@ -284,7 +284,11 @@ def _make_rising_field(draft: Draft, rising: RisingField, container: str = "fram
 
 
 def _find_start_field(draft: Draft, end_field: RisingField) -> RisingField | None:
-    """Return the field that is probably the start of the range that `end_field` ends."""
+    """Return the field with the start of a range; None if there is none.
+
+    Args:
+        end_field: a field that may have the end of this range, for example an end angle.
+    """
     if end_field.kind == "counter":
         return None
     for field in draft.rising_fields:
@@ -329,7 +333,7 @@ def _make_block_field(draft: Draft, blocks: RepeatedBlocks) -> DraftField:
 
 
 def _iter_varying_fields(draft: Draft) -> Iterator[DraftField]:
-    """Yield a field with the bytes of varying length, and then the checksum at the end."""
+    """Yield the field of varying length, and then the checksum after it."""
     assert draft.length is not None
     rest = draft.head_size + draft.tail_size - draft.length.rest
     name = _make_length_field_name(draft)
@@ -348,7 +352,8 @@ def _iter_varying_fields(draft: Draft) -> Iterator[DraftField]:
         evidence: tuple[str, ...] = ()
         if step > 1:
             evidence = (
-                f"the lengths of frames differ by multiples of {step}: samples of {step} bytes?",
+                f"the lengths of frames differ by multiples of {step}, so the field may consist of"
+                f" samples of {step} bytes",
             )
         yield DraftField(
             draft.head_size, 0, f"unknown_{draft.head_size}", f"Bytes({size})", evidence

@@ -100,7 +100,9 @@ class RisingField:
             other field that rises.
         circle: the value at which the field wraps; 0 if no wrap was seen.
         steps: the smallest, usual and largest step.
-        right: the number of regular steps.
+        right: the number of steps that are regular: for a counter, the steps by one; for another
+            field, the steps that are at most `MAX_STEP_RATIO` times the usual step.
+        total: the number of all steps.
         first: for a counter, the value after a wrap.
     """
 
@@ -139,12 +141,13 @@ class RisingField:
         of_steps = f"in {self.right} of {self.total} steps"
         text = f"rises by {step} from {container} to {container}, {of_steps}"
         if self.kind == "angle":
-            return f"{text}, wraps at {self.circle}: {FULL_CIRCLES[self.circle][1]}?"
+            unit = FULL_CIRCLES[self.circle][1]
+            return f"{text}, and wraps at {self.circle}, so the unit may be {unit}"
         if not self.wraps:
             return f"{text}; no wrap found"
         if self.kind == "counter":
-            return f"{text}, wraps from {self.circle - 1} to {self.first}"
-        return f"{text}, wraps at about {self.circle}"
+            return f"{text}, and wraps from {self.circle - 1} to {self.first}"
+        return f"{text}, and wraps at about {self.circle}"
 
 
 def find_rising_fields(rows: NDArray[np.uint8]) -> list[RisingField]:
@@ -284,7 +287,10 @@ def _iter_rising(
 
 
 def _includes_low_byte(field_values: NDArray[np.int64]) -> bool:
-    """Return whether the lowest byte of the values belongs to the field."""
+    """Return whether the lowest byte of the values is a part of the rising field.
+
+    The lowest byte is a part if the steps are more regular with it than without it.
+    """
     steps = np.diff(field_values)
     moved = steps != 0
     coarse_steps = 256 * np.diff(field_values >> 8)
@@ -297,18 +303,20 @@ def _includes_low_byte(field_values: NDArray[np.int64]) -> bool:
     return bool(coarse_changes[both].mean() > MIN_COARSENING * fine_changes[both].mean())
 
 
-def _find_circle(highest: int, fallen: int, usual: int) -> int:
+def _find_circle(highest: int, estimate: int, usual: int) -> int:
     """Return the value at which a field wraps.
 
     Args:
-        fallen: the sum of the decrease at a wrap and the usual step.
+        highest: the largest value of the field.
+        estimate: the decrease at a wrap plus the usual step.
+        usual: the usual step.
     """
     near = [
         circle
         for circle in FULL_CIRCLES
-        if highest < circle <= highest + 3 * usual and abs(fallen - circle) <= 3 * usual
+        if highest < circle <= highest + 3 * usual and abs(estimate - circle) <= 3 * usual
     ]
-    return min(near, key=lambda circle: abs(fallen - circle), default=fallen)
+    return min(near, key=lambda circle: abs(estimate - circle), default=estimate)
 
 
 @dataclass(frozen=True)
@@ -453,7 +461,11 @@ def _find_fixed_length(data: NDArray[np.uint8]) -> FrameStructure | None:
 
 
 def _split_groups(data: NDArray[np.uint8], whole: FrameStructure) -> FrameStructure:
-    """Return the structure of shorter frames if `whole` consists of groups of frames."""
+    """Return the structure of the single frames if frames were found in groups.
+
+    Args:
+        whole: the structure that was found, which is returned if its frames are not groups.
+    """
     # frames can repeat in groups, for example because an index in the frames counts from 0 to 5
     period = whole.period or 0
     for part_size in range(MIN_FRAME_BYTES, period // 2 + 1):
@@ -475,7 +487,11 @@ def _has_counter(structure: FrameStructure) -> bool:
 def _iter_frames_of_length(
     data: NDArray[np.uint8], period: int
 ) -> Iterator[tuple[float, FrameStructure]]:
-    """Yield (weight, structure) of frames with the length `period`, if there are any."""
+    """Yield the structure with frames of the length `period`, if there are such frames.
+
+    The structure comes after its weight, which is the share of the data that consists of constant
+    bytes.
+    """
     count = len(data) // period
     rows = data[: count * period].reshape(count, period)
     usual = find_usual_bytes(rows)

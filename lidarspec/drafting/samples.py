@@ -217,18 +217,18 @@ class SampleFrames:
             return len(self.frames[0])
         return 0
 
-    def take_spread(self, number: int) -> SampleFrames:
+    def select_of_all_lengths(self, number: int) -> SampleFrames:
         """Return at most `number` frames, at equal steps from the shortest to the longest."""
         step = max(1, len(self.frames) // number)
         return SampleFrames(self.frames[::step][:number])
 
-    def take_similar(self, number: int, pick: int) -> SampleFrames:
-        """Return frames of the most frequent length, and up to two of each other length.
+    def select_of_usual_length(self, number: int, pick: int) -> SampleFrames:
+        """Return frames of the most frequent length, and a few frames of other lengths.
 
         Args:
-            number: maximum number of frames of the most frequent length, and maximum number of
-                other lengths.
-            pick: selects which frames of a length are returned.
+            number: maximum number of frames of the most frequent length. The result also has up to
+                two frames of each of up to `number` other lengths.
+            pick: a number from 0, which selects the frames of each length.
         """
         largest = max(self.groups, key=len)
         step = max(1, len(largest) // number)

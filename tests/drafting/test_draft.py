@@ -189,7 +189,7 @@ def test_each_field_has_its_evidence_in_a_comment(tmp_path: Path) -> None:
         encoding="utf-8"
     )
     assert (
-        "# rises by 200 from frame to frame, in 399 of 399 steps, wraps at 36000: hundredths of"
+        "# rises by 200 from frame to frame, in 399 of 399 steps, and wraps at 36000, so the"
         in text
     )
     assert "# the value is between angle_4 of this frame and angle_4 of" in text
