@@ -1,9 +1,10 @@
 """The exceptions of lidarspec: one class for each party that may be at fault.
 
-``SpecError`` reports a mistake of a plugin's author, and its subclass ``PluginError`` a function of
-a plugin that fails. ``UsageError`` reports a mistake of the caller. ``WireError`` reports bytes
-that are not the expected frame, ``SourceError`` a failure of the system, and ``CommandError`` a
-failure of the device. Noise in a stream is not an error: decoders count it.
+``SpecError`` reports a mistake of a plugin's author. Its subclass ``PluginError`` reports that a
+function of a plugin has failed. ``UsageError`` reports a mistake of the caller, and ``WireError``
+reports bytes that are not the expected frame. ``SourceError`` reports a failure of the system, and
+``CommandError`` reports a failure of the device. Noise in a stream is not an error: decoders count
+it.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ _CALLED_PACKAGES = ("construct", "numpy", "pluggy", "hypothesis", "_pytest")
 
 
 def struct_error(error: Exception, *, path: str, sensor: str = "") -> SpecError:
-    """Return the error for an exception from an expression or checksum in a struct."""
+    """Return a `SpecError` for an exception in an expression or checksum of a struct."""
     reason = f"an expression of the struct raised {type(error).__name__}: {error}"
     return SpecError(reason, path=path, sensor=sensor, rule="LS115")
 
@@ -171,7 +172,14 @@ def find_plugin_line(error: BaseException) -> tuple[str, int]:
 def plugin_errors(
     what: str, sensor: str, function: Callable[..., Any] | None = None
 ) -> Iterator[None]:
-    """Convert exceptions of a plugin's function to `PluginError`."""
+    """Convert exceptions in the body of a with statement to `PluginError`.
+
+    Args:
+        what: the text that names the plugin's function in the message, such as "points of data".
+        sensor: the id of the sensor.
+        function: the function, whose first line is the location if no code of the plugin was
+            running.
+    """
     try:
         yield
     except Exception as error:
@@ -253,8 +261,8 @@ class LibraryError(UsageError):
         if installed_version:
             found = f"but version {installed_version} is installed"
         else:
-            found = "which is not installed"
-        super().__init__(f"this requires {needed}, {found}" + (f" ({cause})" if cause else ""))
+            found = "but it is not installed"
+        super().__init__(f"{needed} is required, {found}" + (f" ({cause})" if cause else ""))
         suggest(self, f"pip install 'lidarspec[{extra}]'")
 
 
@@ -510,7 +518,10 @@ class ReplyTimeout(CommandError, TimeoutError):
 
 @contextmanager
 def system_errors(place: object) -> Iterator[None]:
-    """Convert OSError to a `SourceError` that names a place, such as a path.
+    """Convert an OSError in the body of a with statement to a `SourceError`.
+
+    Args:
+        place: the place that the error names, such as a path.
 
     Raises:
         SourceError: for an OSError, and for an invalid path.

@@ -290,7 +290,7 @@ def test_without_numba_asking_for_it_is_an_error_and_nothing_else_is() -> None:
     hidden = "import sys; sys.modules['numba'] = None\n"
     assert run(hidden + DECODING).stdout.split() == ["False", "36"]
     asked = run(hidden + DECODING.replace("* 3)", "* 3, backend='jit')"))
-    assert "LibraryError: this requires numba" in asked.stderr
+    assert "LibraryError: numba" in asked.stderr
     assert "pip install 'lidarspec[jit]'" in asked.stderr
 
 
