@@ -28,7 +28,7 @@ _FOLDERS = (".dist-info", ".egg-info")
 
 
 class _NonFolderPathError(Exception):
-    """Only importlib.metadata can find the installed distributions."""
+    """Distributions may be outside folders, so importlib.metadata has to search."""
 
 
 class EntryPoint(NamedTuple):
