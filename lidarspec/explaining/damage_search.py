@@ -78,29 +78,29 @@ def find_changes(
     """
     if not data:
         return []
-    engine = get_codec(frame)
+    codec = get_codec(frame)
     for kind in kinds:
         added_bytes, choices = KINDS[kind]
         size = len(data) - added_bytes
-        if size == 0 or engine.size not in (None, size):
+        if size == 0 or codec.size not in (None, size):
             continue
-        if size <= max(engine.prefix, default=-1) or size > _find_max_size(engine, kind):
+        if size <= max(codec.prefix, default=-1) or size > _find_max_size(codec, kind):
             continue
-        matching = list(_iter_changes(kind, choices, data, size, engine, offsets))
+        matching = list(_iter_changes(kind, choices, data, size, codec, offsets))
         if matching:
             return matching
     return []
 
 
-def _find_max_size(engine: Codec, kind: str) -> int:
+def _find_max_size(codec: Codec, kind: str) -> int:
     """Return the maximum length of a frame that is searched for changes, in bytes."""
-    is_compiled = isinstance(engine, CompiledCodec)
+    is_compiled = isinstance(codec, CompiledCodec)
     if kind == "lost byte":
-        if is_compiled and _count_layout_fields(engine.frame) <= MAX_LAYOUT_FIELDS:
+        if is_compiled and _count_layout_fields(codec.frame) <= MAX_LAYOUT_FIELDS:
             return MAX_LOST_BYTE_FRAME_BYTES
         return 0
     if is_compiled:
-        return engine.frame.max_length
+        return codec.frame.max_length
     return MAX_PLAIN_FRAME_BYTES
 
 
@@ -112,14 +112,15 @@ def _count_layout_fields(frame: Frame) -> int:
 
 
 def _iter_changes(
-    kind: str, choices: int, data: bytes, size: int, engine: Codec, chosen: Sequence[int] | None
+    kind: str, choices: int, data: bytes, size: int, codec: Codec, offsets: Sequence[int] | None
 ) -> Iterator[FrameChange]:
     """Yield the changes of one kind that explain the damage.
 
     Args:
         choices: number of changes of this kind to try at each offset.
         size: length of the undamaged frame.
-        chosen: the offsets at which changes are tried; None for all.
+        codec: the parser of the frame type.
+        offsets: the offsets at which changes are tried; None for all.
     """
     # A byte may be lost at the end too, which is one more offset than the damaged frame has.
     tried_offsets = np.arange(max(len(data), size))
@@ -129,32 +130,32 @@ def _iter_changes(
         is_first = np.ones(len(damaged), np.bool_)
         is_first[1:] = damaged[1:] != damaged[:-1]
         tried_offsets = tried_offsets[is_first]
-    if chosen is not None:
-        tried_offsets = tried_offsets[np.isin(tried_offsets, chosen)]
-    offsets = np.repeat(tried_offsets, choices)
+    if offsets is not None:
+        tried_offsets = tried_offsets[np.isin(tried_offsets, offsets)]
+    change_offsets = np.repeat(tried_offsets, choices)
     if kind == "inserted byte":
         values = damaged[tried_offsets]
     else:
         values = np.tile(np.arange(choices, dtype=np.uint8), len(tried_offsets))
     if kind == "lost byte":
         # Inserting a byte before or after an equal byte gives the same result: try only before.
-        is_new = values != damaged[offsets - 1]
-        is_new[offsets == 0] = True  # no byte precedes
-        offsets = offsets[is_new]
+        is_new = values != damaged[change_offsets - 1]
+        is_new[change_offsets == 0] = True  # no byte precedes
+        change_offsets = change_offsets[is_new]
         values = values[is_new]
     step = max(1, BATCH_BYTES // size)
-    for first in range(0, len(offsets), step):
+    for first in range(0, len(change_offsets), step):
         part = slice(first, first + step)
-        rows = _undo_changes(kind, damaged, offsets[part], values[part], size)
+        rows = _undo_changes(kind, damaged, change_offsets[part], values[part], size)
         fits = np.ones(len(rows), np.bool_)
-        for offset, (mask, constant) in engine.prefix.items():
+        for offset, (mask, constant) in codec.prefix.items():
             fits &= rows[:, offset] & mask == constant
         which = np.flatnonzero(fits)
         if len(which):
-            survey = engine.survey(rows.reshape(-1), which * size)
+            survey = codec.survey(rows.reshape(-1), which * size)
             which = which[(survey.status == VALID) & (survey.sizes == size)]
         for index in which.tolist():
-            yield FrameChange(kind, int(offsets[first + index]), int(values[first + index]))
+            yield FrameChange(kind, int(change_offsets[first + index]), int(values[first + index]))
 
 
 def _undo_changes(

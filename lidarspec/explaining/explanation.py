@@ -102,7 +102,8 @@ class Explanation:
         """Return the lines of the listing, as spans of text with roles.
 
         Args:
-            every: whether to draw the bits of all elements of an array, instead of only the first.
+            every: whether to draw the bits of every element of an array. By default, only the bits
+                of the first element are drawn.
         """
         return [
             *Listing(self.rows, every=every).lines(),
@@ -121,7 +122,7 @@ class Explanation:
         return [
             pair
             for pair in compared
-            if pair.missing or len(pair.first) != len(pair.second) or any(pair.masks)
+            if pair.only_in or len(pair.first) != len(pair.second) or any(pair.masks)
         ]
 
     def to_dict(self) -> dict[str, Any]:
@@ -158,7 +159,7 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
         frame: the frame type; by default the type that fits best.
 
     Raises:
-        WireError: if no frame type of the sensor begins like the bytes.
+        WireError: if the bytes do not begin like a frame of the sensor.
         UnknownFrame: if the sensor has no such frame type.
     """
     data = bytes(data)
@@ -293,10 +294,13 @@ def _find_point_numbers(
     """Return the indices of the points in a row.
 
     Args:
-        chain: the paths of the nested arrays that contain the points, outermost first.
-        axes: the path of the array for each dimension of `numbers`; None for a dimension without an
-            array.
-        numbers: the index of the point in each array element; -1 for an element without a point.
+        path: the path of the row, for example "blocks[0].channels[3]".
+        chain: the paths of the nested arrays that contain the points, outermost first, for example
+            ("blocks", "blocks.channels").
+        axes: for each dimension of `numbers`, the path of its array; None for a dimension that
+            belongs to no array.
+        numbers: for each element of the arrays, the index of its point; -1 for an element without
+            a point.
     """
     indices = [int(part.partition("]")[0]) for part in path.split("[")[1:]]
     if not chain:

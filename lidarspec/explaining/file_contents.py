@@ -95,9 +95,10 @@ class SensorContent:
         share: the share of the bytes that are in valid frames, from 0 to 1; None if the file names
             the sensor.
         options: command-line options that select the sensor; "" if the file names the sensor.
-        reading: statistics of the part that was decoded; None if the data cannot be decoded.
-        incomplete_returns: the number of incomplete groups of packets in the decoded part. The
-            packets of a group contain the returns of the same firings.
+        reading: statistics of the decoded part, such as scans per second; None if the data cannot
+            be decoded.
+        incomplete_returns: if the returns of the same firings are in separate packets, the number
+            of firings in the decoded part of which a packet is missing.
         info: the facts that the sensor reports about itself in the decoded part, by name.
         clock: a description of the sensor's clock in the decoded part; "" if the sensor sends no
             time.
@@ -164,7 +165,7 @@ class FileContents:
         return (self.last_ns - self.first_ns) * 1e-9
 
     @property
-    def read_seconds(self) -> float | None:
+    def seconds_read(self) -> float | None:
         """The duration of the part that was read, in seconds; None if unknown."""
         if self.first_ns is None or self.last_read_ns is None:
             return None
@@ -330,9 +331,10 @@ def _make_content(path: str, verdict: Verdict) -> SensorContent:
 
 
 def _measure(source: str, sensor: Sensor) -> dict[str, Any]:
-    """Return statistics of the beginning of a file, as attributes of `SensorContent`.
+    """Decode the beginning of a file, and return statistics of its data.
 
-    Returns an empty dict if the frames cannot be decoded.
+    Returns:
+        Attributes of `SensorContent`: name -> value; an empty dict if the frames cannot be decoded.
     """
     try:
         with Device(source, sensor) as device:
@@ -383,7 +385,7 @@ def _make_rows(contents: FileContents) -> Sequence[tuple[str, str]]:
         lines.append(("time", f"{format_date(contents.first_ns)}{until}"))
     else:
         lines.append(("time", "no arrival times"))
-    seconds = contents.read_seconds or 0.0
+    seconds = contents.seconds_read or 0.0
     if seconds:
         rate = f", {contents.packets / seconds:.1f}/s, {contents.bytes / seconds / 1e3:.1f} kB/s"
     else:

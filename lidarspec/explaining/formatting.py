@@ -90,7 +90,7 @@ class FieldValue:
         raw: the raw value, a number or bytes.
         physical: the value in `unit`; None if the value is not a number.
         unit: the unit; "" if the field has none.
-        number_format: the digits to print.
+        number_format: how `physical` is printed, for example with two decimals.
         label: the name of the raw value; "" if it has none.
         is_unknown: whether other values of the field have names, but this value has none.
         bits: a text with the bits of the field, e.g. ".. 000001.."; "" if the field consists of
@@ -206,14 +206,14 @@ class ExplainedRow:
         """A line with the values and their units, remarks, documentation and points."""
         return "".join(text for text, _ in self.spans())
 
-    def spans(self, *, drawn: bool = False) -> list[TextSpan]:
+    def spans(self, *, omits_values: bool = False) -> list[TextSpan]:
         """Return the parts of `meaning` with their roles.
 
         Args:
-            drawn: whether to omit the values, because the listing draws their bits below the row.
+            omits_values: whether to omit the values, for a row with its bits drawn below it.
         """
         alone = len(self.values) == 1 and not self.values[0].bits
-        values = [] if drawn else self._format_values(alone=alone)
+        values = [] if omits_values else self._format_values(alone=alone)
         verdict = "good" if self.matches_spec else "bad"
         docs = self.values[0].docs if alone and self.is_in_first_element else ""
         points = list(dict.fromkeys(str(point) for point in self.points))
@@ -297,7 +297,7 @@ class FieldDifference:
     second: bytes
 
     @property
-    def missing(self) -> str:
+    def only_in(self) -> str:
         """ "first" or "second" if only this frame has the field; "" if both have it."""
         if self.before is None:
             return "second"
@@ -365,29 +365,29 @@ def to_json_number(value: Any) -> Any:
     return value
 
 
-def format_limits(low: float, high: float, between: str = "..") -> str:
+def format_limits(low: float, high: float, separator: str = "..") -> str:
     """Format a range of numbers, e.g. "0..4294967295"; all digits of an integer are shown."""
-    return between.join(
+    return separator.join(
         f"{end:.0f}" if float(end).is_integer() else f"{end:g}" for end in (low, high)
     )
 
 
-def format_argument_type(kind: Taken, between: str = "..") -> str:
+def format_argument_type(kind: Taken, separator: str = "..") -> str:
     """Return the range of a command argument if it is a number, otherwise its type."""
     if isinstance(kind, Range):
-        return format_limits(kind.low, kind.high, between)
+        return format_limits(kind.low, kind.high, separator)
     return kind.describe(None)
 
 
-def describe_argument(sensor: Sensor, command: str, argument: str, between: str = "..") -> str:
+def describe_argument(sensor: Sensor, command: str, argument: str, separator: str = "..") -> str:
     """Describe the values that an argument accepts: by name, by range, or by type."""
     kind = sensor.commands[command].arguments[argument].kind
     if isinstance(kind, Range):
         choices = list_choices(find_argument_slot(sensor, command, argument).info, kind)
         if has_only_names(kind, choices):
             return "|".join(choices)
-        return "|".join([*choices, format_argument_type(kind, between)])
-    return format_argument_type(kind, between)
+        return "|".join([*choices, format_argument_type(kind, separator)])
+    return format_argument_type(kind, separator)
 
 
 def format_ascii(data: bytes | bytearray) -> str:

@@ -180,18 +180,18 @@ def _make_value(field: WireField, info: FieldInfo) -> FieldValue:
     )
 
 
-def _describe_checksum(seal: PlacedSeal) -> tuple[str, bool]:
+def _describe_checksum(checksum: PlacedSeal) -> tuple[str, bool]:
     """Return a text about a stored checksum, and whether the checksum is valid."""
-    algorithm = seal.seal.algorithm
-    count = sum(end - start for start, end in seal.seal.spans)
+    algorithm = checksum.seal.algorithm
+    count = sum(end - start for start, end in checksum.seal.spans)
     plural = "s" if count != 1 else ""
-    stored = format_hex(seal.stored, algorithm.width)
-    computed = format_hex(seal.computed, algorithm.width)
-    if seal.stored == seal.computed:
+    stored = format_hex(checksum.stored, algorithm.width)
+    computed = format_hex(checksum.computed, algorithm.width)
+    if checksum.stored == checksum.computed:
         verdict = "ok"
-    elif seal.is_right:
+    elif checksum.is_right:
         verdict = "means no checksum"
     else:
         verdict = f"wrong, expected {computed}"
     how = f"({algorithm.describe()} over {count} byte{plural})"
-    return f"{stored} {verdict} {how}", seal.is_right
+    return f"{stored} {verdict} {how}", checksum.is_right

@@ -161,7 +161,7 @@ def explain_piece(
             type that fits best.
 
     Raises:
-        WireError: if no frame type begins like the bytes of a piece of the type `NEAREST`.
+        WireError: if the bytes of a piece of the type `NEAREST` do not begin like a frame.
     """
     if piece.frame:
         yield piece, explain(piece.data, sensor, piece.frame if piece.is_valid else frame)
@@ -223,7 +223,7 @@ def find_likely_starts(sensor: Sensor, data: bytes) -> list[int]:
 
 
 def _find_nearest_type(sensor: Sensor, data: bytes) -> str:
-    """Return the frame type that begins like the bytes; "" if there is none."""
+    """Return the frame type that the bytes fit best; "" if they begin like no frame."""
     try:
         return identify(sensor, data[: _find_max_length(sensor)])
     except WireError as fault:

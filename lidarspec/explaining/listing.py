@@ -44,7 +44,7 @@ def join_text(line: Line) -> str:
 
 
 def fold(line: Line, width: int) -> Line:
-    """Insert line breaks into a line that is wider than `width` characters."""
+    """Break a line that is wider than `width` characters into several lines."""
     indent = sum(len(span.text) for span in line[:COLUMN_COUNT])
     if len(join_text(line)) <= width or indent + MIN_FOLDED_WIDTH > width:
         return line
@@ -125,7 +125,7 @@ class Listing:
             row.offset,
             TextSpan(parts[0].hex(" "), role),
             _indent_path(row.path, depth),
-            row.spans(drawn=drawn),
+            row.spans(omits_values=drawn),
         )
         for row_number, part in enumerate(parts[1:], 1):
             yield (
@@ -187,9 +187,9 @@ def list_differences(differences: list[FieldDifference], sizes: tuple[int, int])
     Args:
         sizes: the sizes of the frames, in bytes.
     """
-    for missing, group in groupby(differences, lambda difference: difference.missing):
-        if missing:
-            yield _make_missing_line(list(group), missing)
+    for only_in, group in groupby(differences, lambda difference: difference.only_in):
+        if only_in:
+            yield _make_only_in_line(list(group), only_in)
             continue
         for difference in group:
             yield from _iter_difference_lines(difference)
@@ -237,7 +237,7 @@ def _iter_difference_lines(difference: FieldDifference) -> Iterator[Line]:
                 )
 
 
-def _make_missing_line(group: list[FieldDifference], which: str) -> Line:
+def _make_only_in_line(group: list[FieldDifference], which: str) -> Line:
     """Return a line for consecutive fields that only one frame has.
 
     Args:
