@@ -108,7 +108,10 @@ class ExportedFrame:
 
     @property
     def seals(self) -> dict[str, tree.Sealed]:
-        """The checksum node of each field that stores a checksum or a part of one."""
+        """The nodes with checksums, by the path of each field that stores a checksum.
+
+        If a checksum is stored in several fields, all their paths are keys.
+        """
         return {
             path: node
             for node in tree.nodes(self.root)
@@ -117,20 +120,20 @@ class ExportedFrame:
         }
 
 
-def list_frames(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ...]:
+def list_frames(sensor: Sensor, *, omit_encoded: bool = True) -> tuple[ExportedFrame, ...]:
     """Return the frame types of a sensor that can be exported, in declared order.
 
     Args:
-        on_wire: whether to omit frame types with a wire form (text or escaped bytes), which other
-            languages cannot decode.
+        omit_encoded: whether to omit frame types that are sent as text or as escaped bytes. Most
+            exports contain no code to decode these.
 
     Raises:
         ExportError: if the sensor has no frames until it is configured, if a frame contains Python
-            code, or if all frame types have a wire form.
+            code, or if all frame types would be omitted.
     """
     if not sensor.frames:
         raise ExportError(f"{sensor.id} has no frames until it is configured")
-    with_form = _find_wire_forms(sensor) if on_wire else {}
+    with_form = _find_wire_forms(sensor) if omit_encoded else {}
     if len(with_form) == len(sensor.frames):
         raise ExportError(
             f"{sensor.id}: this export does not support frames of text or of escaped bytes:"
@@ -176,7 +179,7 @@ def find_references(node: tree.Node) -> list[tree.Ref]:
 
 
 def find_required_formulas(node: tree.Node) -> dict[str, tree.Formula]:
-    """Return the formulas whose value a field must have, as {path: formula}."""
+    """Return the fields that must have the value of a formula: path -> formula."""
     return {
         info.path: info.rebuilt
         for info in tree.infos(node)

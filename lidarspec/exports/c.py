@@ -313,9 +313,10 @@ def _iter_length_checks(layout: CLayout) -> Iterator[str]:
 def _format_checksum(
     layout: CLayout, entry: CEntry, seal: Sealed, name: str, algorithm: str
 ) -> str:
-    held = [access for path in seal.fields for access in find_accesses(layout, path)]
+    checksum_fields = [access for path in seal.fields for access in find_accesses(layout, path)]
     for path in seal.fields:
-        if [access.depth for access in held if access.info.path == path] != [entry.depth]:
+        depths = [access.depth for access in checksum_fields if access.info.path == path]
+        if depths != [entry.depth]:
             raise ExportError(
                 f"{path}: the export to C does not support a checksum that is stored in several places"
             )
@@ -324,25 +325,33 @@ def _format_checksum(
         parameters=format_parameters(entry.depth),
         arguments=format_arguments(entry.depth),
         spans=", ".join(
-            f"{{{start}, {end}}}" for start, end in _iter_covered_spans(layout, entry, seal, held)
+            f"{{{start}, {end}}}"
+            for start, end in _iter_covered_spans(layout, entry, seal, checksum_fields)
         ),
         algorithm=algorithm,
-        stored=_format_stored_checksum(held, seal.algorithm.order),
+        stored=_format_stored_checksum(checksum_fields, seal.algorithm.order),
         absent="".join(f"stored == UINT64_C({value}) || " for value in seal.absent),
     )
 
 
 def _iter_covered_spans(
-    layout: CLayout, entry: CEntry, seal: Sealed, held: list[CEntry]
+    layout: CLayout, entry: CEntry, seal: Sealed, checksum_fields: list[CEntry]
 ) -> Iterator[tuple[SizeFormula, SizeFormula]]:
-    """Yield the byte ranges that a checksum covers."""
+    """Yield the byte ranges that a checksum covers.
+
+    Args:
+        entry: the struct with the checksum.
+        checksum_fields: the fields that store the checksum.
+    """
     if seal.over is not None:
         first, last = (layout.find_whole(path) for path in seal.over)
         yield first.start, last.start + last.size
         return
     start = entry.start
     order = {id(other.node): number for number, other in enumerate(layout.entries)}
-    for access in sorted(held, key=lambda access: (order[id(access.node)], access.span[0])):
+    for access in sorted(
+        checksum_fields, key=lambda access: (order[id(access.node)], access.span[0])
+    ):
         first_byte, size = access.span
         begin = access.start + SizeFormula(first_byte)
         if str(begin) != str(start):
@@ -352,16 +361,16 @@ def _iter_covered_spans(
         yield start, entry.start + entry.size
 
 
-def _format_stored_checksum(held: list[CEntry], order: str) -> str:
+def _format_stored_checksum(checksum_fields: list[CEntry], order: str) -> str:
     """Return the C expression of a checksum that is stored in one or more fields.
 
     Args:
-        held: the fields that store the checksum, the field with the lowest bits first.
+        checksum_fields: the fields that store the checksum, the field with the lowest bits first.
         order: the byte order of a checksum in a field of bytes.
     """
     terms = []
     shift = 0
-    for access in held:
+    for access in checksum_fields:
         node = access.node
         if isinstance(node, Blob):
             assert isinstance(node.size, int)

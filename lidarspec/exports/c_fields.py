@@ -111,7 +111,7 @@ class CEntry:
     """A node of a frame tree, at one position in the frame.
 
     Attributes:
-        path: the path of the node, without indices; for an array, its `axis`.
+        path: the path of the node, without indices; for an array, `Repeat.axis`.
         start: the offset of the first byte of the node in the frame.
         size: the size of the node in bytes.
         depth: the number of arrays around the node.
@@ -181,7 +181,11 @@ class CEntry:
 
     @property
     def condition(self) -> str:
-        """The C condition under which a C function returns this field; "" for always."""
+        """The C condition under which a C function returns the value of this entry.
+
+        This is `full_condition`, and for a part in an array inside a bit block, also the comparison
+        of the array indices. The condition is "" if the entry always has the value.
+        """
         inside = [
             f"{name_index(self.depth + level)} == {number}"
             for level, number in enumerate(self.indices)
@@ -201,7 +205,7 @@ class CLayout:
     """The entries of a frame type, in wire order.
 
     Attributes:
-        name: a function that returns the C name for a path and an ending.
+        name: a function (path, ending) that returns a C name.
         size: size of a frame, in bytes.
 
     Raises:
@@ -225,7 +229,7 @@ class CLayout:
         ]
 
     def find_whole(self, path: str) -> CEntry:
-        """Return the entry that contains all elements or alternatives of a node."""
+        """Return the entry of a node with all its elements and alternatives."""
         return next(entry for entry in self.entries if entry.path == path)
 
     def format_formula(self, value: tree.Formula) -> str:
@@ -303,7 +307,7 @@ class CLayout:
         return sum((self.compute_size(below) for below in self._iter_members(entry)), SizeFormula())
 
     def make_size_function_name(self, entry: CEntry) -> str:
-        """Return the name of the size function of a part with alternatives."""
+        """Return the name of the C function for the size of a `When` or `Select` node."""
         choices = [
             node
             for node in tree.nodes(self.message.root)
@@ -313,7 +317,7 @@ class CLayout:
         return self.name(entry.path, f"extent{alike.index(id(entry.node)) or ''}")
 
     def list_sizes(self, entry: CEntry) -> list[tuple[str, SizeFormula]]:
-        """Return the sizes of the alternatives of a part, each with its condition."""
+        """Return the sizes of the alternatives of a node, each with its condition."""
         return [
             (condition.text, self.compute_size(below))
             for condition, below in self._list_cases(entry)
@@ -371,7 +375,7 @@ class CLayout:
         return size
 
     def _list_cases(self, entry: CEntry) -> list[tuple[CCondition, CEntry]]:
-        """Return the alternatives of a part, each with its condition."""
+        """Return the alternatives of a node, each with its condition."""
         node = entry.node
         is_fixed = not any(
             ref.info.axes for value in tree.formulas(node) for ref in tree.refs(value)
@@ -476,7 +480,7 @@ def _iter_writers(entry: CEntry) -> Iterator[tuple[Writer, str]]:
 
 
 def _iter_size_functions(layout: CLayout) -> Iterator[str]:
-    """Yield a C function for the size of each part whose alternatives differ in size."""
+    """Yield a C function for the size of each node whose alternatives differ in size."""
     for entry in layout.entries:
         if isinstance(entry.node, tree.When | tree.Select):
             sizes = layout.list_sizes(entry)

@@ -88,8 +88,7 @@ class _ItemBuilder:
     """Converts the tree of a frame type to items.
 
     Attributes:
-        seals: the node with the checksum algorithm, by the path of the field that stores the
-            checksum.
+        seals: as in `ExportedFrame`.
         has_both_orders: whether the frame has numbers in both byte orders.
     """
 
@@ -287,7 +286,7 @@ def svg(sensor: Sensor) -> str:
         ExportError: if the content of a frame depends on Python code.
     """
     sheet = _Sheet()
-    for message in list_frames(sensor, on_wire=False):
+    for message in list_frames(sensor, omit_encoded=False):
         size = frame_size(message.frame)
         order = find_byte_order(message)
         detail = f"{size} byte{'s' * (size != '1')}" + (
@@ -363,7 +362,7 @@ class _Sheet:
                 self._draw_box(item)
 
     def close(self) -> None:
-        """End the last row and leave space before the next frame type."""
+        """End the last row of a frame type, and leave space before the next frame type."""
         self._end_row()
         self.top += 26
 

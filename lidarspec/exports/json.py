@@ -59,7 +59,8 @@ def to_data(sensor: Sensor) -> dict[str, Any]:
         "sequence": _sequence_data(sensor.sequence),
         "fillers": sensor.fillers.hex(),
         "frames": {
-            message.name: _frame_data(message) for message in list_frames(sensor, on_wire=False)
+            message.name: _frame_data(message)
+            for message in list_frames(sensor, omit_encoded=False)
         },
         "commands": {name: _command_data(command) for name, command in sensor.commands.items()},
         **select_attributes(sensor, "on_open", "on_close"),
@@ -263,7 +264,7 @@ def node_data(node: tree.Node) -> dict[str, Any]:
 
 
 def _parts_data(node: tree.PartSequence) -> dict[str, Any]:
-    """Return a sequence of parts as JSON data: its kinds of parts, and where it ends."""
+    """Return a sequence of frames in a frame as JSON data: the kinds, and the end."""
     rules = {"count": node.count, "size": node.size, "within": node.within}
     data = {name: formula_data(rule) for name, rule in rules.items()}
     kinds = [

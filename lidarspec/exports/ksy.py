@@ -125,8 +125,8 @@ def _format_of_last_part(formula: tree.Formula, scope: Scope) -> str:
     """Return a formula that Kaitai evaluates after each part to find the last part.
 
     Args:
-        formula: a path that begins with "_." is a field of the frame; any other path is a field of
-            the part.
+        formula: the condition. A path in it that begins with "_." is a field of the frame, and any
+            other path is a field of the part.
     """
 
     def format_field(ref: tree.Ref) -> str:
@@ -201,9 +201,13 @@ def make_block_type(
 def inline_block(
     block: tree.Block, more: Mapping[str, Any]
 ) -> tuple[Attribute, dict[str, Attribute]] | None:
-    """Return (attribute, instances) of a bit block that consists of a single integer.
+    """Return the attribute and the instances of a bit block with a single integer.
 
-    Returns None for any other block.
+    Args:
+        more: further keys of the attribute.
+
+    Returns:
+        None if the block has several integers, or requires a type of its own for another reason.
     """
     if len(block.parts) != 1 or block.parts[0].names or block.parts[0].indices or not block.name:
         return None
@@ -277,8 +281,13 @@ def _find_bit_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
 
 
 def _find_starts(bits: BitField, suffix: str) -> set[int]:
-    """Return the positions at which the field begins, calculated from each segment."""
-    # if all segments give the same position, Kaitai can read the field as consecutive bits
+    """Return the bit position of the field's begin, calculated from each segment.
+
+    A single position means that the bits of the field are consecutive, so that Kaitai can read it.
+
+    Args:
+        suffix: the bit order, "be" or "le".
+    """
     ahead = ((segment, segment.low - segment.target) for segment in bits.segments)
     return {
         8 * segment.byte + (bits_ahead if suffix == "le" else 8 - bits.width - bits_ahead)
@@ -387,8 +396,7 @@ class _KaitaiWriter:
     """Writes the types of one frame.
 
     Attributes:
-        seals: the node with the checksum algorithm, by the path of the field that stores the
-            checksum.
+        seals: as in `ExportedFrame`.
     """
 
     seals: Mapping[str, tree.Sealed]
@@ -455,7 +463,7 @@ class _KaitaiWriter:
     def _add_parts(
         self, kaitai: _KaitaiType, node: tree.PartSequence, scope: Scope, **more: Any
     ) -> None:
-        """Add the attribute of a sequence of parts, which must all have the same type."""
+        """Add the attribute of a sequence of frames in the frame, all of the same type."""
         if len(node.kinds) > 1:
             raise ExportError(
                 f"{node.axis}: Kaitai cannot distinguish kinds of parts by their constants"
@@ -488,7 +496,7 @@ class _KaitaiWriter:
     def _add_typed(
         self, kaitai: _KaitaiType, name: str, node: tree.Node, scope: Scope, **more: Any
     ) -> None:
-        """Add an attribute, and a new type for it."""
+        """Add a new type for `node`, and an attribute of this type."""
         name = identifier(name)
         kaitai.types[name] = self._make_type(node, scope)
         kaitai.seq.append({"id": name, "type": name, **more})
@@ -504,7 +512,7 @@ class _KaitaiWriter:
                 if not part.indices:
                     self._add_physical(kaitai, part.info, {}, name="_".join(part.names) or "value")
             return kaitai.finish(node.info.path)
-        self._add_member(kaitai, _name_value(node), (*scope, None))
+        self._add_member(kaitai, _rename_to_value(node), (*scope, None))
         return kaitai.finish(node.name)
 
     def _add_repeat(
@@ -633,8 +641,8 @@ def _format_size(formula: tree.Formula, scope: Scope) -> int | str:
     return format_integer(formula, scope)
 
 
-def _name_value(node: tree.Node) -> tree.Node:
-    """Return an array element or an alternative, renamed to `value`."""
+def _rename_to_value(node: tree.Node) -> tree.Node:
+    """Return an array element or an alternative with the name `value`."""
     if isinstance(node, tree.Number):
         parent = node.info.path.rpartition(".")[0]
         return replace(node, info=replace(node.info, path=f"{parent}.value" if parent else "value"))

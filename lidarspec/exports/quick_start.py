@@ -39,7 +39,7 @@ def list_commands(sensor: Sensor, source: str = "") -> list[tuple[str, str]]:
         ]
     return [
         detect,
-        (f"lidarspec view {source} {sensor_option}", "draw its scans (--web: a page)"),
+        (f"lidarspec view {source} {sensor_option}", "draw its scans; with --web, on a web page"),
         record,
         ("lidarspec convert a.lsr a.foxglove.mcap", "open the result in Foxglove"),
         (f"lidarspec ros2 {source} {sensor_option}", "publish it in ROS 2"),

@@ -54,7 +54,7 @@ def pyi(sensor: Sensor) -> str:
     Raises:
         ExportError: if a frame contains Python code, or two frame types have the same class name.
     """
-    frames = list_frames(sensor, on_wire=False)
+    frames = list_frames(sensor, omit_encoded=False)
     names = {message.name: to_class_name(message.name) for message in frames}
     if len(set(names.values())) < len(names):
         raise ExportError(f"{sensor.id}: two frame types have the same class name")

@@ -141,7 +141,7 @@ class _TableWriter:
     Attributes:
         prefix: the text before the path of a field in Wireshark's filters.
         kept: the paths of the fields that formulas or checksums use.
-        marked: the paths of the first and the last part that each checksum covers.
+        marked: the paths of the first and the last member that each checksum covers.
         types: the type family (for example "uint") of each Wireshark field, by its name in filters.
     """
 
@@ -157,7 +157,7 @@ class _TableWriter:
         self.marked = {path for seal in message.seals.values() for path in seal.over or ()}
         self.types: dict[str, str] = {}
 
-    def node(self, node: tree.Node, path: str = "") -> Table:
+    def make_table(self, node: tree.Node, path: str = "") -> Table:
         """Return the table of a node."""
         match node:
             case tree.Number():
@@ -172,7 +172,7 @@ class _TableWriter:
                 return {
                     "kind": "sealed",
                     "name": node.name or None,
-                    "body": self.node(node.body),
+                    "body": self.make_table(node.body),
                     "seal": self._make_seal_table(node),
                 }
             case tree.Repeat():
@@ -180,8 +180,8 @@ class _TableWriter:
             case tree.PartSequence():
                 return self._make_parts_table(node)
             case tree.When():
-                then = self.node(node.then, path)
-                otherwise = self.node(node.otherwise, path)
+                then = self.make_table(node.then, path)
+                otherwise = self.make_table(node.otherwise, path)
                 return {
                     "kind": "when",
                     "name": node.name,
@@ -190,8 +190,8 @@ class _TableWriter:
                     "no": otherwise,
                 }
             case tree.Select():
-                cases = {value: self.node(case, path) for value, case in node.cases}
-                default = self.node(node.default, path)
+                cases = {value: self.make_table(case, path) for value, case in node.cases}
+                default = self.make_table(node.default, path)
                 return {
                     "kind": "select",
                     "name": node.name,
@@ -300,7 +300,7 @@ class _TableWriter:
         members = []
         for member in node.members:
             path = ".".join(filter(None, (node.path, member.name)))
-            table = self.node(member, path)
+            table = self.make_table(member, path)
             members.append(table | {"mark": path} if path in self.marked and member.name else table)
         sizes = [None if "mark" in member else member.get("skip") for member in members]
         total = None if None in sizes else sum(filter(None, sizes))
@@ -323,7 +323,7 @@ class _TableWriter:
         }
 
     def _make_repeat_table(self, node: tree.Repeat, path: str) -> Table:
-        element = self.node(node.element, path)
+        element = self.make_table(node.element, path)
         size = element.get("skip")
         if isinstance(node.count, int) and size is not None:
             whole = size * node.count
@@ -361,7 +361,7 @@ class _TableWriter:
             kinds.append(
                 {
                     "magic": magic,
-                    "element": self.node(kind.element),
+                    "element": self.make_table(kind.element),
                     "following": None if after is None else format_formula(after),
                 }
             )
@@ -652,7 +652,7 @@ def _make_frame_entry(message: ExportedFrame, name: str) -> dict[str, Any]:
         "judged": True if message.frame.plausible else None,
         "sent": None if message.frame.direction == "in" else True,
         "magic": [[offset, mask, value] for offset, (mask, value) in sorted(prefix.items())],
-        "root": _TableWriter(message, f"{name}.{message.name}").node(message.root),
+        "root": _TableWriter(message, f"{name}.{message.name}").make_table(message.root),
     }
 
 
