@@ -60,11 +60,11 @@ class Batch:
         state: for each other frame type, a table of its frames, and an array (n,) with the row of
             the last frame before each packet; -1 for a packet before the first frame.
         defaults: the declared defaults of state columns, by frame type and path.
-        carry: the values from the previous batch, by the number of the call of `previous` or
-            `last`.
+        carry: the values from the previous batch that each call of `previous` or `last` needs:
+            number of the call in the function, from 0 -> values.
         nominal: whether a declared default of a state column was used.
-        left: for each call of `previous` or `last`, a function that returns the values for the next
-            batch.
+        left: for each of these calls so far, a function that returns the values for the next batch.
+            Its argument is the index of the packet with which the next batch begins.
     """
 
     table: Table
@@ -79,11 +79,15 @@ class Batch:
         return len(self.table)
 
     def carry_over(self, ready: int) -> Carry:
-        """Return the values that the next batch, which starts at packet `ready`, needs."""
+        """Return the values that the next batch needs, as its `carry`.
+
+        Args:
+            ready: the index of the packet with which the next batch begins.
+        """
         return {slot: rest(ready) for slot, rest in enumerate(self.left)}
 
     def of(self, group: LayoutRows) -> Batch:
-        """Return the packets of a group as a batch of its own."""
+        """Return a batch with only the packets of a group, without `carry`."""
         table = CompiledTable(
             self.table.schema, [LayoutRows(group.layout, np.arange(len(group.where)), group.rows)]
         )
@@ -133,7 +137,7 @@ class Column(NDArrayOperatorsMixin):
 
     @property
     def seen(self) -> NDArray[Any]:
-        """The values; in a traced column, only the sample values."""
+        """The values; of a column in `graph.trace`, only the values of the sample packets."""
         return self.array
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -191,14 +195,15 @@ class Column(NDArrayOperatorsMixin):
     def on(self, *axes: str) -> Column:
         """Return the same values along other arrays of the frame.
 
-        The values are put along the innermost named arrays, one array for each axis of the column.
-        If such an array is longer than the axis, the missing elements are nan.
+        Each axis of the column becomes the axis of one array. If an array is longer than the axis,
+        the missing elements are nan.
 
         Args:
-            axes: the paths or the last names of the arrays.
+            axes: the paths or the last names of the arrays. If these are more arrays than the
+                column has axes, the innermost arrays are used.
 
         Raises:
-            SpecError: if the column has more axes than are named, or if an array is unknown.
+            SpecError: if the column has more axes than `axes`, or if an array is unknown.
         """
         schema = self.batch.table.schema
         own = [index for index, name in enumerate(self.axes) if name is not None]
@@ -241,7 +246,7 @@ class Column(NDArrayOperatorsMixin):
         )
 
     def steps(self) -> AlongAxis | NDArray[np.intp]:
-        """Return the numbers below the largest value of the column: 0, 1, 2 ...
+        """Return the numbers 0, 1, 2 ... below the largest value in the whole column.
 
         If the column is the length of an array, the numbers are the indices of this array.
         """
@@ -373,7 +378,7 @@ class FlatColumn:
         else:
             full = np.broadcast_to(column.array, self._shape)
         flat = full.reshape(self._shape[0], math.prod(self._shape[1:]))
-        self._mask = padding_mask(column.axes, self._shape, column.batch)
+        self._mask = make_value_mask(column.axes, self._shape, column.batch)
         self.values = np.asarray(
             (flat if self._mask is None else flat[self._mask]).reshape(-1), np.float64
         )
@@ -396,12 +401,12 @@ class FlatColumn:
         return full.reshape(self._shape)
 
 
-def padding_mask(
+def make_value_mask(
     axes: tuple[str | None, ...], shape: tuple[int, ...], batch: Batch
 ) -> NDArray[np.bool_] | None:
-    """Return a mask of the elements that are not padding; None without padding.
+    """Return a mask that is False for the padding of arrays of variable length.
 
-    The mask has the shape (n, number of elements in a packet).
+    The mask has the shape (n, number of elements in a packet). It is None if there is no padding.
     """
     mask: NDArray[np.bool_] | None = None
     for index, axis in enumerate(axes):
@@ -500,7 +505,11 @@ def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
 
 
 def _merge_axis_names(first: str | None, name: str | None) -> str | None:
-    """Return the common name of an axis of two values; None is no name.
+    """Return the name of an axis that two values share; None if it has no name.
+
+    Args:
+        first: the name of the axis of one value; None if it has no name.
+        name: the name of the axis of the other value; None if it has no name.
 
     Raises:
         SpecError: if two names that were not guessed belong to different arrays.
@@ -658,12 +667,14 @@ def align_points(
 
 
 def _find_extent(table: Table, axis: str, length: int) -> int:
-    """Return the length to use for values along an array of the frame.
+    """Return how many values along an array of the frame are used.
 
     Args:
         axis: the path of the array.
+        length: the number of values, which may exceed the length of the array.
     """
-    # An array in an outer array without elements has no length of its own.
+    # The array does not exist in a packet with an empty outer array. Values that are longer than
+    # the array are then cut. In all other cases, they cause an error when arrays are aligned.
     if any((table.counts(other) == 0).any() for other in table.schema.outer(axis)):
         return min(length, table.length(axis))
     return length
@@ -723,7 +734,7 @@ def _describe_lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None
 
 
 def _need_no_alignment(values: tuple[Any, ...]) -> bool:
-    """Return whether all operands are columns or numbers."""
+    """Return whether operands with the same axes are all columns or numbers."""
     return all(isinstance(value, Column | int | float) for value in values)
 
 
@@ -843,7 +854,7 @@ class Fields:
     """The fields of a batch of packets as attributes, which are columns.
 
     ``f.points.distance`` is a field, and ``f.state.difop.vertical`` is a field of another frame
-    type. In parts, ``f.frame.counter`` is a field of the frame that contains the part.
+    type. If the packets are parts of a frame, ``f.frame.counter`` is a field of that frame.
 
     Args:
         prefix: the names of the enclosing structs, each followed by a dot.

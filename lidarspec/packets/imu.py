@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import plugin_errors
-from lidarspec.expressions.columns import Batch, Fields, align_points, padding_mask
+from lidarspec.expressions.columns import Batch, Fields, align_points, make_value_mask
 from lidarspec.points.conventions import vendor_turn
 from lidarspec.points.reference_evaluator import flatten_valid
 from lidarspec.spec.results import Imu
@@ -112,7 +112,7 @@ def read_samples(
         names = (*UNITS, "time")
         arrays, array_axes, _, shape = align_points(dict(zip(names, columns, strict=True)), batch)
         *components, offsets_s = arrays
-        mask = padding_mask(array_axes, shape, batch)
+        mask = make_value_mask(array_axes, shape, batch)
         offsets_ns = np.rint(np.nan_to_num(np.asarray(offsets_s, np.float64)) * 1e9)
         packet_ns = time_ns.reshape(-1, *[1] * len(array_axes))  # as many axes as the arrays
         sample_ns = flatten_valid(packet_ns + offsets_ns.astype(np.int64), shape, mask, len(batch))

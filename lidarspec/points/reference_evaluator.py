@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import plugin_errors
-from lidarspec.expressions.columns import Batch, Carry, Fields, align_points, padding_mask
+from lidarspec.expressions.columns import Batch, Carry, Fields, align_points, make_value_mask
 from lidarspec.frames.frame_table import Table
 from lidarspec.framing.results import Counters
 from lidarspec.points import conventions
@@ -153,7 +153,7 @@ def _make_points(
     parts = list_parts(result)
     arrays, axes, ready, shape = align_points(parts, batch)
     ready = len(packets) if final else ready
-    mask = padding_mask(axes, shape, batch)
+    mask = make_value_mask(axes, shape, batch)
     every = {
         name: flatten_valid(array, shape, mask, ready)
         for name, array in zip(parts, arrays, strict=True)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import LidarSpecError, SpecError, UsageError
-from lidarspec.expressions.columns import Fields, align, padding_mask
+from lidarspec.expressions.columns import Fields, align, make_value_mask
 from lidarspec.expressions.graph import Node, make_sample, trace, traverse
 from lidarspec.frames.frame_table import CompiledTable
 from lidarspec.framing.example_frames import make_random_header, random_frame
@@ -199,7 +199,7 @@ def calculate_directions(
     shape = np.broadcast_shapes(
         (len(packets), *(1,) * len(axes)), *(array.shape for array in arrays)
     )
-    mask = padding_mask(axes, shape, batch)
+    mask = make_value_mask(axes, shape, batch)
     whole = [
         np.broadcast_to(np.asarray(array, np.float64), shape).reshape(
             shape[0], math.prod(shape[1:])
