@@ -131,7 +131,7 @@ class LinkState:
         return self._senders.other_sender or self._transport.other_sender
 
     def _describe_silence(self) -> str:
-        """Return a text about a silent link, with the number of datagrams of other senders."""
+        """Return a text about a silent link and the datagrams of other senders."""
         seconds = f"{self.silent_for:.1f} s"
         other = self._other_sender
         if other is None:

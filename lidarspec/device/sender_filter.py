@@ -235,7 +235,7 @@ class SenderFilter(SenderCheck):
 
 
 def frame_senders(chunks: Sequence[Chunk], frames: Frames, end: int) -> list[tuple[str, Sender]]:
-    """Return the senders of the frames in some datagrams, as pairs (frame type, sender).
+    """Return pairs (frame type, sender) for the frames in some datagrams.
 
     The result has one pair for each frame, or, if all datagrams have the same sender, one pair for
     each frame type. If the sender of any datagram is unknown, the result is empty.

@@ -96,7 +96,7 @@ class LimitedRecorder:
 
     @property
     def duration(self) -> float | None:
-        """Seconds from the first to the last recorded arrival; None if nothing has arrived."""
+        """Seconds from the first to the last recorded arrival; None if there is none."""
         if self.first is None or self.last is None:
             return None
         return (self.last - self.first) / 1e9
@@ -299,7 +299,7 @@ class SourceRecording:
     def _count_queued(
         self, source: LiveTransport, queue: BoundedQueue, recorder: LimitedRecorder, wait: float
     ) -> list[LinkEvent]:
-        """Take all items from the queue, count the recorded datagrams, and return the events.
+        """Empty the queue: count the recorded datagrams, and return the link events.
 
         Args:
             wait: maximum time to wait for an item, in seconds.

@@ -487,7 +487,7 @@ def _has_counter(structure: FrameStructure) -> bool:
 def _iter_frames_of_length(
     data: NDArray[np.uint8], period: int
 ) -> Iterator[tuple[float, FrameStructure]]:
-    """Yield the structure with frames of the length `period`, if there are such frames.
+    """Yield the structure with frames of the length `period`, if there are any.
 
     The structure comes after its weight, which is the share of the data that consists of constant
     bytes.
