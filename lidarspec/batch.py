@@ -167,7 +167,7 @@ class FilePiece:
                 break
         scans.add_warnings(sieve.warnings)
         if sieve.is_empty:
-            raise sieve.make_missing_error()
+            raise sieve.make_no_scan_error()
 
 
 @functools.lru_cache(maxsize=64)

@@ -133,9 +133,10 @@ def normalise_path(path: object) -> str:
 
 
 def read_stamp(path: str) -> dict[str, Any]:
-    """Return the size of a file and the time of its last change, as `size` and `modified`.
+    """Return {"size": size in bytes, "modified": text} for a file.
 
-    Some stores provide a tag instead of the time.
+    The text differs after each change of the file. It is the time of the last change, or the tag
+    (ETag) that a store gives to each version of a file; "" if the store provides neither.
 
     Raises:
         SourceError: if the file does not exist.

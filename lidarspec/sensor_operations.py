@@ -32,23 +32,24 @@ class Sensor(SensorDescription):
         vendor, model: names as the vendor writes them.
         frames: all frame types by name, in both directions. If bytes match several types, the first
             in this order is chosen.
-        points: a function of `Fields` that returns `Polar` or `Cartesian`; None if each data frame
-            has a function of its own, or if the sensor has no points, which means that no frame has
-            ``data=True``.
+        points: a function that takes `Fields` and returns `Polar` or `Cartesian`. None if each data
+            frame has its own function (`Frame.points`), or if the sensor has no points. A sensor
+            without points has no frame with ``data=True``.
         scan: the rule by which a scan ends and the next one begins; None without points.
         links: the links by name. Data is received on the link "data". Each command names the link
             on which it is sent.
         commands: the commands by name.
         clock: the sensor's clock, if it has one.
         sequence: the packet counter, if it has one.
-        fillers: bytes that the sensor sends between frames; they are counted separately.
-        state: default values for ``f.state``, by frame and field path, in the unit of the field.
+        fillers: bytes that the sensor sends between frames. They do not count as invalid bytes.
+        state: default values of fields of other frames, by frame and field path, in the unit of the
+            field. `points` reads these values with ``f.state`` until such a frame arrives.
         simulation: additional facts for a simulated sensor.
         configure: a function of the sensor and its options (keyword arguments) that returns another
             sensor. The annotations of its parameters are the possible values of the options.
-        recognise: a function that is needed if data frames do not contain their own layout. Its
-            argument is a list of datagrams. It returns the options of `configure` with which the
-            datagrams can be decoded, or {} if they are not from such a sensor.
+        recognise: a function that is needed if the layout of data frames depends on options of
+            `configure`. It takes a list of datagrams, and returns the options with which they can
+            be decoded, or {} if the datagrams are not from this sensor.
         on_open, on_close: names of the commands that are sent when a device is opened or closed.
         range_limits: the shortest and the longest range in metres that the sensor can measure; None
             without points.
@@ -58,10 +59,11 @@ class Sensor(SensorDescription):
         returns: the names of the returns of a firing, by return index, if they are not in the order
             of their distance. A name is "first", "last", "strongest", "second strongest", or
             "varying" if it depends on a setting of the sensor. `Selection` uses these names.
-        turn: the lowest and the highest number of scans per second.
+        turn: (lowest, highest) number of scans per second.
         relatives: ids of related models, installed or not, and how each differs from this sensor.
-            The difference is a text if it is found from the speed of the clock or the model in
-            `info`, and a `Relative` if it is found in single packets.
+            If single packets show the difference, it is a `Relative`. Otherwise it is a text, and
+            the model is recognised by the speed of its clock, or by the name of the model in
+            `info`.
         info: fields with information about the device: name -> "frame.path", or a `Reported`. The
             names "serial", "firmware", "model" and "temperature" have a meaning for all sensors.
         status: how the description was verified: "manual", "vectors", "capture" or "hardware".
@@ -107,8 +109,9 @@ class Sensor(SensorDescription):
         """Return the bytes of one frame; constants, counts and checksum are filled in.
 
         Args:
-            value: a mapping of all fields, such as the result of `parse`. `values` override it; a
-                field of a nested struct is given by its path: ``**{"flags.valid": 1}``.
+            value: a mapping of fields, such as the result of `parse`.
+            values: fields as keyword arguments, which override those in `value`. The name of a
+                field in a nested struct is its path: ``**{"flags.valid": 1}``.
             units: whether values are physical; they are rounded to the nearest raw value.
 
         Raises:
@@ -253,11 +256,11 @@ class Sensor(SensorDescription):
             )
         scans = iter_scans(self, [packets], imu)
         if select is None:
-            return self._warn_after(scans, packets)
-        return self._warn_after(ScanSelector(select, "the data").iter_selected(scans), packets)
+            return self._iter_and_warn(scans, packets)
+        return self._iter_and_warn(ScanSelector(select, "the data").iter_selected(scans), packets)
 
-    def _warn_after(self, scans: Iterator[Any], packets: Packets) -> Iterator[Scan]:
-        """Yield the scans, then warn about errors of the plugin or scans without an end."""
+    def _iter_and_warn(self, scans: Iterator[Any], packets: Packets) -> Iterator[Scan]:
+        """Yield the scans. Then warn if the plugin raised errors, or if no scan ended."""
         yield from scans
         if packets.stats.unended:
             warnings.warn(f"{self.id}: {packets.stats.unended}", stacklevel=2)

@@ -430,7 +430,7 @@ def _select_frames(
             note(warning)
     for wanted in slices.values():
         if wanted.first is not None and not number:
-            raise wanted.missed_error(device.source, "frames")
+            raise wanted.make_no_data_error(device.source, "frames")
 
 
 def _take_types(packets: Packets, types: Sequence[str]) -> dict[str, Packets]:

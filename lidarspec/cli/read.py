@@ -200,7 +200,7 @@ def _iter_packets(
     for warning in clock.warnings:
         note(warning)
     if wanted.first is not None and not number:
-        raise wanted.missed_error(device.source)
+        raise wanted.make_no_data_error(device.source)
 
 
 def _to_scalar(value: Any) -> Any:

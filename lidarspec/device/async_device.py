@@ -95,7 +95,7 @@ class AsyncDevice:
             if sieve.ended:
                 break
         if sieve.is_empty:
-            raise sieve.make_missing_error()
+            raise sieve.make_no_scan_error()
 
     async def imu(self) -> AsyncIterator[ImuSamples]:
         """Yield the samples of the sensor's IMU; see `Device.imu`."""

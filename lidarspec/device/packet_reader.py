@@ -18,7 +18,7 @@ from lidarspec.packets.imu import WaitingSamples, join_samples
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import ImuStream, PacketStream, choose_data_frame
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.stream import ScanStream, iter_released
+from lidarspec.scans.stream import ScanStream, pop_scans
 from lidarspec.sensor_operations import Sensor
 
 #: Maximum number of `Frames`, each from a piece of input, that are kept until the type of the data
@@ -110,7 +110,7 @@ class PacketReader:
             packets = self.read_packets(batch)
             self.read_imu(batch, packets)
         if packets is not None and len(packets):
-            yield from iter_released(stream.add(packets))
+            yield from pop_scans(stream.add(packets))
         if batch.interrupted:
             yield from stream.finish()
 

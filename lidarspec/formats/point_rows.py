@@ -14,7 +14,7 @@ from lidarspec.formats.common import select_columns, to_image, write_in_thread
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.table_types import STRUCTURED
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.stream import iter_released
+from lidarspec.scans.stream import pop_scans
 
 #: The first columns of a row; additional columns follow.
 COLUMN_NAMES = STRUCTURED.names or ()
@@ -72,7 +72,7 @@ class PointRows:
             units = [f"unit {name} {unit}" for name, unit in cloud.units.items() if unit]
             self.facts = [f"sensor {first[0].sensor.id}", f"stamp_ns {cloud.stamp_ns}", *units]
         self.dtype = layout(types)
-        self._scans = itertools.chain(iter_released(first), scans)
+        self._scans = itertools.chain(pop_scans(first), scans)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
         return itertools.starmap(self.fill, self.iter_parts())

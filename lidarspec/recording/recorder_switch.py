@@ -24,7 +24,8 @@ class RecordingSwitch:
         folder: the folder of the files.
 
     Attributes:
-        trouble: a message if the last call failed or ended an empty file; else "".
+        trouble: a message if the last switching failed, or if it ended a file without data; else
+            "". `error` has the error of a file that is still open.
         written: (path, number of data bytes) of each closed file.
     """
 
@@ -39,24 +40,30 @@ class RecordingSwitch:
         self.written: list[tuple[str, int]] = []
 
     def attach(self, opened: Transport) -> TrafficLog:
-        """Set the transport to record, and return this recorder; for `open(record=...)`."""
+        """Store the transport that this recorder records, and return this recorder.
+
+        To record a source, pass this method as the argument `record` of `open`.
+        """
         self._opened = opened
         return self
 
     def toggle(self) -> None:
-        """Start or end a recording."""
+        """Start a file if the recorder is off; end the current file if it is on."""
         with self._changing:
             self._change(on=self._recorder is None)
 
-    def set(self, *, on: bool) -> None:
-        """Start or end a file. Does nothing if the recorder is already in this state."""
+    def set_state(self, *, on: bool) -> None:
+        """Switch the recorder on to start a file, or off to end the current file.
+
+        Does nothing if the recorder is already in this state.
+        """
         with self._changing:
             if on == (self._recorder is None):
                 self._change(on=on)
 
     @property
-    def recording(self) -> tuple[str, int] | None:
-        """(name, number of data bytes) of the current file; None if there is no file."""
+    def current_file(self) -> tuple[str, int] | None:
+        """(name, number of data bytes) of the current file; None if the recorder is off."""
         current = self._recorder
         if current is None:
             return None

@@ -1,7 +1,8 @@
 """Recorders: write received and sent data to a file while it is captured.
 
-The suffix of the file selects the format: .lsr for all data, .pcap and .pcapng for packets that
-Wireshark can open, .bin for raw bytes.
+The suffix of the file selects the format. A recording of lidarspec (.lsr) contains all received and
+sent data with arrival times and events. A capture (.pcap, .pcapng) contains the received data as
+packets that Wireshark can open. A .bin file contains only the received bytes.
 """
 
 from __future__ import annotations
@@ -64,7 +65,9 @@ RecordTo = str | Path | BackgroundWriter | Callable[[Transport], TrafficLog] | R
 
 
 class Recorder(BackgroundWriter):
-    """Writes an .lsr recording; a context manager. Any thread may call `write`.
+    """Writes an .lsr file, the recording format of lidarspec; a context manager.
+
+    Any thread may call `write`. `open_recorder` makes the recorders for other formats.
 
     If the file cannot be written, the capture continues: `write` raises no error. The error is
     stored in `error`, and raised once, by the next `sync` or by `close`. The file is then valid up
@@ -162,7 +165,8 @@ class PcapRecorder(BackgroundWriter):
         """Record a received datagram. Sent datagrams are ignored.
 
         Raises:
-            UsageError: for invalid addresses.
+            UsageError: if the sender or the receiver of the chunk is not an IP address with a valid
+                port, or if the data is too long for a datagram.
         """
         if direction == "in":
             datagram = Datagram(
@@ -308,9 +312,15 @@ def open_recorder(
 def get_recorder(
     target: RecordTo, sensor: Sensor | str | None, source: str | Path, opened: Transport
 ) -> tuple[TrafficLog, bool]:
-    """Return the recorder for a target, and whether this function made it.
+    """Return the recorder for a target, and whether the caller must close it.
 
-    The caller must close a recorder that this function made.
+    The caller must close every recorder except one that was passed as `target`.
+
+    Args:
+        target: the path of a file, a recorder, or an object that makes the recorder.
+        sensor: the sensor of the source if it is known.
+        source: the source of the data, for the header of an .lsr file.
+        opened: the open transport of the source.
     """
     if isinstance(target, BackgroundWriter):
         return target, False

@@ -10,9 +10,9 @@ Modules in reading order:
 * `stream`: `ScanStream`, which makes scans of batches of packets as they arrive.
 * `cutter`: `ScanCutter`, which decides where a scan ends and whether it is complete.
 * `scan_ends`: the ends of scans by the sensor's rule.
-* `rotation`: the rows at which a turning angle passes a given angle.
+* `rotation`: the points or packets at which a rotating angle passes a given angle.
 * `limits`: the maximum duration and size of a scan.
 * `completeness`: the packets of a scan, and the packets missing in it.
-* `masking`: the masked sector of a rotating sensor, in which scans are cut.
+* `masking`: the sector in which a rotating sensor sends no packets; scans end and begin in it.
 * `selection`: selects scans of a source, parts of scans, and bytes by arrival time.
 """

@@ -1,7 +1,8 @@
 """Project planar scans onto one grid of angles.
 
-A planar scan is a scan of a planar sensor, or one ring or layer of another sensor. The first
-complete scan determines the grid: the number of beams, the first angle and the last angle.
+A planar scan is a scan of a planar sensor, or the points of another sensor that are in one ring or
+between two heights. The first complete scan determines the grid: the number of beams, the first
+angle and the last angle.
 """
 
 from __future__ import annotations
@@ -30,10 +31,11 @@ class PlanarScans:
     Args:
         beams: the number of beams; by default the number that the scan or the sensor declares, or
             the number of points of the first complete scan.
-        field: the first and the last angle, radians; by default the sensor's field of view.
-        ring: the ring to use from a sensor with several rings.
-        heights: the layer to use from a sensor with several rings: the points with low <= z < high,
-            given as (low, high) in metres.
+        field: the first and the last angle, radians; by default the angles of the first complete
+            scan, or a whole turn if this scan covers nearly a turn.
+        ring: the number of the ring to use, for a sensor with several rings.
+        heights: (low, high) in metres, to use only the points with low <= z < high, for a sensor
+            with several rings.
     """
 
     def __init__(
@@ -67,7 +69,10 @@ class PlanarScans:
         return level.to_laserscan(*self._grid)
 
     def _take_level(self, scan: Scan) -> Scan | None:
-        """Return the scan with the points of the chosen ring or layer only."""
+        """Return the scan with only the points of the chosen ring or heights.
+
+        Returns None if neither is chosen and the points are not in one plane.
+        """
         cloud = scan.points
         if self._ring is None and self._heights is None:
             if self._is_flat is None and cloud.valid.any():

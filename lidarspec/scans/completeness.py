@@ -1,7 +1,8 @@
 """Count the packets of the current scan, and the packets that are missing in it.
 
-A frame counts as one packet, even if it has parts. A packet that contains the end of a scan counts
-in this scan and in the next one.
+If the points are in parts of the frames (`Parts`), each part is a row of `Packets`, but all parts
+of a frame together count as one packet. A packet in which a scan ends counts in this scan and in
+the next one.
 """
 
 from __future__ import annotations
@@ -27,14 +28,15 @@ class PacketCounts:
         counts: 1 for each whole frame and for the first part of a frame; 0 for all other parts.
         sizes: the sizes of the packets, in bytes or in points.
         missing: the number of packets missing directly before each packet.
-        is_broken: whether an unknown number of packets is missing directly before each packet.
+        follows_gap: whether packets are missing directly before each packet, even if their number
+            is unknown.
     """
 
     times: Integers
     counts: Integers
     sizes: NDArray[np.intp]
     missing: Integers
-    is_broken: NDArray[np.bool_]
+    follows_gap: NDArray[np.bool_]
 
     @classmethod
     def of(
@@ -56,19 +58,19 @@ class PacketCounts:
             previous_index = index.item(0) - 1
         frames, rows = packets.frames
         is_in_parts = frames is not packets.table
-        is_broken = packets.breaks[:number]
+        follows_gap = packets.breaks[:number]
         if is_in_parts or packets.masked is not None or index.item(-1) - previous_index != number:
             steps = np.diff(index, prepend=previous_index)
             missing = np.maximum(steps - 1, 0)
             if packets.masked is not None:
                 masked = packets.masked[:number]
                 missing = np.maximum(missing - masked, 0)
-                is_broken = is_broken & (masked == 0)
-            is_broken = is_broken | (missing > 0)
+                follows_gap = follows_gap & (masked == 0)
+            follows_gap = follows_gap | (missing > 0)
         else:
             missing = repeat(0, number)
-            if is_broken.any():
-                is_broken = is_broken.copy()
+            if follows_gap.any():
+                follows_gap = follows_gap.copy()
         counts = repeat(1, number)
         if is_in_parts:
             counts = (steps != 0).astype(np.int64)
@@ -77,7 +79,7 @@ class PacketCounts:
             sizes = frames.sizes[rows][:number]
             if is_in_parts:
                 sizes = sizes * counts
-        return cls(packets.time_ns[:number], counts, sizes, missing, is_broken)
+        return cls(packets.time_ns[:number], counts, sizes, missing, follows_gap)
 
     def part(self, start: int, stop: int) -> PacketCounts:
         """Return the counts of the packets in rows `start` to `stop - 1`."""
@@ -87,18 +89,20 @@ class PacketCounts:
             self.counts[rows],
             self.sizes[rows],
             self.missing[rows],
-            self.is_broken[rows],
+            self.follows_gap[rows],
         )
 
     def share_with_next_scan(self, row: int) -> None:
-        """Count a packet in the next scan, although the previous scan ended in it."""
-        # The packets missing before it count in the previous scan only.
+        """Change the counts of a packet in which a scan has ended, for the next scan.
+
+        The packet counts in the next scan as well. The packets missing before it do not.
+        """
         if not self.counts[row]:
             self.counts[row] = 1
         if self.missing[row]:
             self.missing[row] = 0
-        if self.is_broken[row]:
-            self.is_broken[row] = False
+        if self.follows_gap[row]:
+            self.follows_gap[row] = False
 
 
 class OpenScan(NamedTuple):
@@ -110,7 +114,7 @@ class OpenScan(NamedTuple):
         packets: the number of packets of the scan.
         size: the size of the scan, in bytes or in points.
         lost: the number of packets missing in the scan.
-        is_broken: whether an unknown number of packets is missing in the scan.
+        is_broken: whether packets are missing in the scan, even if their number is unknown.
     """
 
     has_start: bool = False
@@ -122,7 +126,10 @@ class OpenScan(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether the start of the scan and at least half of its packets have arrived."""
+        """Whether the scan is whole in the sense of `Scan.whole`, if it ends now.
+
+        This requires the start of the scan, and at least half of its packets.
+        """
         return self.has_start and self.lost <= self.packets
 
     @property
@@ -141,14 +148,14 @@ class OpenScan(NamedTuple):
             self.packets + _sum(packets.counts),
             self.size + _sum(packets.sizes),
             self.lost + _sum(packets.missing),
-            self.is_broken or bool(packets.is_broken.any()),
+            self.is_broken or bool(packets.follows_gap.any()),
         )
 
     def add_gap(self, packets: PacketCounts) -> OpenScan:
         """Add the packets missing before `packets`, and return the counts of the scan."""
         return self._replace(
             lost=self.lost + _sum(packets.missing),
-            is_broken=self.is_broken or bool(packets.is_broken.any()),
+            is_broken=self.is_broken or bool(packets.follows_gap.any()),
         )
 
 

@@ -44,7 +44,7 @@ class ScanCutter:
         assert rule is not None  # as of every sensor with points
         self._ends = EndFinder(sensor)
         self._limits = ScanLimits(sensor)
-        self._warning = f"{_describe_missing_end(rule)} within {self._limits.seconds:.3g} s"
+        self._warning = _describe_missing_end(rule, self._limits.seconds)
         self._has_start_flag = isinstance(rule, OnFlag)
         # with these rules, two scans without the end between them look like one long scan
         self._may_miss_ends = isinstance(rule, OnWrap | OnFlag)
@@ -61,7 +61,7 @@ class ScanCutter:
         self._last_index: int | None = None
 
     def use_sector(self, sector: Sector, angle: float | None) -> None:
-        """Cut scans in a masked sector from now on.
+        """From now on, let scans end and begin in a masked sector.
 
         Args:
             angle: the angle of the last packet before the sector was found, in turns; None if there
@@ -144,7 +144,7 @@ class ScanCutter:
     def _cut_at_limits(
         self, packets: Packets, counts: PacketCounts, start: int, stop: int
     ) -> NDArray[np.intp]:
-        """Add packets to the scan, and return the rows before which it exceeds the limits."""
+        """Add packets; return the rows before which scans are cut to keep the limits."""
         cuts = list[int]()
         while start < stop:
             part_stop = min(start + SEARCHED_PACKETS, stop)
@@ -183,12 +183,13 @@ def _find_packet(end: ScanEnd, first: NDArray[np.intp]) -> int:
     return int(np.searchsorted(first, end.point, side="right")) - 1
 
 
-def _describe_missing_end(rule: Split) -> str:
+def _describe_missing_end(rule: Split, limit_s: float) -> str:
+    """Return the warning that no scan has ended within a time limit, in seconds."""
     if isinstance(rule, OnWrap):
         return (
-            f"the angle does not pass {rule.at:g} ({rule.name}): is the rotor blocked? No scan"
-            " was completed"
+            f"the angle {rule.name!r} did not pass {rule.at:g} within {limit_s:.3g} s, so no scan"
+            " was completed: is the rotor blocked?"
         )
     if isinstance(rule, Every):
-        return "no scan was completed"
-    return f"{rule.name} did not mark the end of a scan"
+        return f"no scan was completed within {limit_s:.3g} s"
+    return f"{rule.name!r} did not mark the end of a scan within {limit_s:.3g} s"

@@ -1,7 +1,8 @@
 """Limit the duration and the size of scans, in case the end of a scan is missing.
 
 A scan takes at most twice the time of the slowest revolution, and has at most twice the number of
-points of a whole scan. If this number varies, the size in bytes is limited.
+points that the sensor declares. If this number varies, the size in bytes is limited. A scan with
+missing packets may have only a few packets more than an earlier scan.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ SLOWEST_TURN_S = 1.0
 MIN_LIMIT_S = 1.0
 #: The size limit, bytes, if the number of points varies and the source is not a serial line.
 MAX_BYTES = 1 << 26
-#: A scan with missing packets may have at most this factor times the packets of a whole scan.
+#: A scan with missing packets may have at most this factor times the packets of an earlier scan.
 MAX_GROWTH = 1.125
 
 
@@ -54,13 +55,14 @@ class ScanLimits:
         elif isinstance(link, Serial):
             self._largest = self.seconds * link.baud / 10
 
-    def allows(self, scan: OpenScan, packets: PacketCounts, usual: float) -> bool:
+    def allows(self, scan: OpenScan, packets: PacketCounts, usual_count: float) -> bool:
         """Return whether a scan is within the limits.
 
         Args:
-            scan: the counts of the scan, in which `packets` are already included.
+            scan: the counts of the scan with `packets`.
             packets: the last packets of the scan.
-            usual: the number of packets of a whole scan.
+            usual_count: the number of packets, received and missing, of an earlier scan; inf if it
+                is unknown.
         """
         latest = int(packets.times.max())
         earliest = int(packets.times.min())
@@ -68,27 +70,30 @@ class ScanLimits:
             return False
         if scan.size > self._largest:
             return False
-        return not scan.lost or scan.packets - 1 + scan.lost <= MAX_GROWTH * usual
+        return not scan.lost or scan.packets - 1 + scan.lost <= MAX_GROWTH * usual_count
 
     def find_excess(
-        self, scan: OpenScan, packets: PacketCounts, usual: float
+        self, scan: OpenScan, packets: PacketCounts, usual_count: float
     ) -> tuple[int | None, bool]:
         """Find the first packet with which a scan exceeds the limits.
 
         Args:
-            scan: the counts of the scan before the next packets.
-            usual: the number of packets of a whole scan.
+            scan: the counts of the scan without `packets`.
+            packets: the next packets.
+            usual_count: as for `allows`.
 
         Returns:
-            The row of this packet, or None; and True for a limit of all scans, False for the limit
-            of scans with missing packets.
+            (row, is_overdue). `row` is the row of this packet; None if there is none. `is_overdue`
+            is True if the scan exceeds its maximum duration or size. It is False if the scan
+            exceeds only the number of packets that a scan with missing packets may have, or if
+            `row` is None.
         """
         since = scan.since if scan.packets else packets.times.item(0)
         is_overdue = np.abs(packets.times - since) > self.longest_ns
         is_overdue |= scan.size + np.cumsum(packets.sizes) > self._largest
         lost = scan.lost + np.cumsum(packets.missing)
         length = scan.packets + np.cumsum(packets.counts) - 1 + lost
-        is_over = is_overdue | ((lost > 0) & (length > MAX_GROWTH * usual))
+        is_over = is_overdue | ((lost > 0) & (length > MAX_GROWTH * usual_count))
         if not scan.packets:
             is_over[0] = False  # a scan has at least one packet
         row = int(is_over.argmax())

@@ -1,7 +1,12 @@
 """Find the masked sector of a rotating sensor, and mark the packets after it.
 
-The sector is found in the first revolutions of a stream. If the angle leaps, packets are held for
-about one revolution, so that the first scans are cut in the sector as well.
+A masked sector is a range of angles in which the sensor is configured to send no packets. The mark
+of a packet, `Packets.masked`, is the number of packets that the sector leaves out before it.
+
+The sector is found in the first revolutions of a stream. A step of the angle that is much larger
+than other steps (a leap) may be the sector, or may be caused by lost packets. After the first leap,
+packets are held for about one revolution, until this is known. Therefore even the first scans can
+end and begin in the sector.
 """
 
 from __future__ import annotations
@@ -128,7 +133,11 @@ class Masking:
         return [released if self.sector is None else self._set_masked(released)]
 
     def _find_leap(self, packets: Packets, angles: Angles) -> int | None:
-        """Search the next packets for the sector, and return the row of the first leap."""
+        """Search the next packets for the masked sector.
+
+        Returns:
+            The row of the packet after the first leap of the angle; None if there is no leap.
+        """
         if self._finder is None:
             direction = self._reader.direction(packets.table)
             if not direction:
@@ -183,7 +192,10 @@ class Masking:
         return packets
 
     def _set_masked(self, packets: Packets) -> Packets:
-        """Return packets with `Packets.masked` set at the sector."""
+        """Return the packets with `Packets.masked` set.
+
+        It is 0 for all packets except the packets directly after the sector.
+        """
         angles = self._reader.angles(packets.table)
         sector = self.sector
         if not self._has_marked:
@@ -220,5 +232,6 @@ def describe_sector(sector: Sector) -> str:
         angles.reverse()
     return (
         f"no revolution has points from about {angles[0]:.0f} to {angles[1]:.0f} degrees. The"
-        " sector is assumed to be masked: it does not count as loss, and scans begin in it"
+        " sensor is assumed to be configured to send nothing in this sector: the sector does not"
+        " count as packet loss, and scans begin in it"
     )

@@ -64,7 +64,11 @@ class Provenance:
         self._indices = indices
 
     def select(self, indices: NDArray[np.intp]) -> Provenance:
-        """Return the origins of some points of the scan, given their indices."""
+        """Return the provenance of some points of the scan.
+
+        Args:
+            indices: the indices of these points in the scan, (k,).
+        """
         if self._indices is not None:
             indices = self._indices[indices]
         return Provenance(self._runs, indices)
@@ -89,7 +93,7 @@ class Provenance:
     def iter_packets(self) -> Iterator[Packets]:
         """Yield the packets that the points came from, in stream order.
 
-        After unpickling there are no packets.
+        Yields nothing if the scan has been unpickled, because packets are not pickled.
         """
         for run in self._runs:
             first, last = first_points(run.points).searchsorted([run.start, run.stop - 1], "right")

@@ -1,7 +1,8 @@
 """Find the rows at which a rotating angle passes a given angle.
 
-`WrapDetector` is for an unknown direction of rotation, and `PassDetector` for a known direction.
-The division of a stream into batches does not change their results.
+A row is a point or a packet. `WrapDetector` is for an unknown direction of rotation, and
+`PassDetector` for a known direction. The division of a stream into batches does not change their
+results.
 """
 
 from __future__ import annotations
@@ -96,7 +97,11 @@ class Rotation:
 
 
 class WrapDetector:
-    """Finds the rows at which an angle passes a given angle, in either direction."""
+    """Finds the rows at which an angle passes a given angle, in an unknown direction.
+
+    The direction is measured, and may reverse. A step of more than half a turn is taken for a
+    shorter step in the other direction.
+    """
 
     def __init__(self) -> None:
         self._rotation = Rotation()
@@ -158,7 +163,9 @@ class WrapDetector:
 
 
 class PassDetector:
-    """Finds the rows at which an angle passes a given angle, or leaps over it.
+    """Finds the rows at which an angle passes a given angle, in a known direction.
+
+    A step may leap over the given angle. It may be of almost a whole turn.
 
     Args:
         at: the angle to pass, in turns.

@@ -30,10 +30,11 @@ class Scan:
         points: the points, in stream order.
         rate_hz: scans per second, computed from the time between this scan and the next one; nan if
             unknown, or if the scan is not whole.
-        complete: whether start and end have arrived and no packet is missing. The first and the
-            last scan of a stream are not complete.
+        complete: whether the scan has a start and an end, and no packet is missing. The first and
+            the last scan of a stream are not complete.
         sensor: the sensor that measured the points.
-        whole: whether start, end and at least half of the packets have arrived.
+        whole: whether the scan has a start, an end and at least half of its packets. A whole scan
+            may have missing packets; a complete scan is always whole.
         imu: the samples of the IMU from the first point up to the first point of the next scan;
             None without an IMU, or if its clock differs from the clock of the points.
         host_ns: the arrival time of the packet with the first point, int64 ns since 1970; 0 if
@@ -41,9 +42,10 @@ class Scan:
         beams: the default number of beams of `to_laserscan`; None to use the number that the sensor
             declares, or the number of points.
         frame_id: the name of the frame of reference in ROS messages.
-        number: the index of the scan in its file; None if the file is not read in pieces.
-        mount: the mount, if the points are in the axes of the carrier; None if they are in the axes
-            of the sensor.
+        number: the index of the scan in its file, if only a piece of the file is read or written at
+            a time; else None.
+        mount: the position and orientation of the sensor on its carrier (such as a vehicle), if the
+            points are in the axes of the carrier; None if they are in the axes of the sensor.
         provenance: finds the frame that a point came from.
     """
 
@@ -137,7 +139,8 @@ class Scan:
         Args:
             beams: the number of angles; by default the attribute `beams`.
             field: the first and the last angle, radians; by default a whole turn from -pi on. If
-                scans begin inside the field, the times of the beams are wrong.
+                scans begin at an angle between these two, the times of some beams are wrong by one
+                revolution.
 
         Raises:
             UsageError: if `beams` is not a positive whole number.

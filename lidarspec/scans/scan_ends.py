@@ -39,7 +39,8 @@ class ScanEnd(NamedTuple):
     Attributes:
         point: the index of the first point after the end.
         packet: the row of the packet that shows the end; None if a point shows the end.
-        is_leap: whether the angle advances much more at this end than at the previous end.
+        is_leap: whether the angle advances much more at this end than at the previous end, which
+            means that packets are probably missing.
     """
 
     point: int
@@ -267,7 +268,10 @@ def _read_rows(column: Column, points: EvaluatedPoints) -> tuple[Floats, Indices
 
 
 def first_points(points: EvaluatedPoints) -> Indices:
-    """Return the index of the first point of each packet, (points.ready,)."""
+    """Return the index of the first point of each packet, (n,).
+
+    There are n = `points.ready` packets with points. Later packets wait for the next batch.
+    """
     points_per_packet = _sum_axes(points.counts, 1)
     return np.cumsum(points_per_packet) - points_per_packet
 

@@ -58,8 +58,9 @@ class Selection:
         returns: the return of each firing to keep: "first", "last", "strongest", or "all". It is
             chosen among the returns inside `ranges`.
         columns: the names of the columns of the points, in this order; () for all columns.
-        time: the clock of the stamps and of `times`: "sensor"; "utc", by the sensor's clock or else
-            by the arrival times; or "host" for the arrival time of the first packet of a scan.
+        time: the clock of the stamps and of `times`: "sensor" for the clock of the sensor; "utc"
+            for UTC, from the clock of the sensor if possible, otherwise from the arrival times;
+            "host" for the arrival time of the first packet of a scan.
         beams: the default number of beams, see `Scan`.
         frame_id: the name of the frame of reference, see `Scan`.
 
@@ -81,7 +82,8 @@ class Selection:
         start, stop = self.scans
         if min(start, stop or 0) < 0:
             raise UsageError(
-                "scans are counted from the first one; negative numbers are not supported"
+                f"the indices of scans must be at least 0, not {min(start, stop or 0)}: the first"
+                " scan has the index 0"
             )
         begin, end = self.times
         object.__setattr__(self, "times", (_add_zone(begin), _add_zone(end)))
@@ -96,19 +98,19 @@ class Selection:
             raise UsageError(f"returns must be one of {', '.join(RETURNS)}, not {self.returns!r}")
 
     @property
-    def is_timed(self) -> bool:
-        """Whether scans are selected by time."""
+    def has_time_limits(self) -> bool:
+        """Whether `times` limits the selected scans."""
         return self.times != (None, None)
 
     @property
-    def is_counted(self) -> bool:
-        """Whether scans are counted, to select them by index, time or step."""
-        return self.is_timed or self.scans != (0, None) or self.every != 1
+    def is_partial(self) -> bool:
+        """Whether only some scans are selected, by `times`, `scans` or `every`."""
+        return self.has_time_limits or self.scans != (0, None) or self.every != 1
 
     @property
     def needs_all_scans(self) -> bool:
         """Whether all earlier scans are needed to select a scan or to find its time."""
-        return self.is_counted or self.time == "utc"
+        return self.is_partial or self.time == "utc"
 
 
 def _add_zone(moment: Moment | None) -> Moment | None:
@@ -121,7 +123,7 @@ def _add_zone(moment: Moment | None) -> Moment | None:
 def _check_order(low: Any, high: Any) -> None:
     """Raise UsageError unless `low` is less than `high`."""
     if isinstance(low, datetime) != isinstance(high, datetime):
-        raise UsageError(f"expected two dates or two times, got {low} to {high}")
+        raise UsageError(f"expected two dates or two numbers of seconds, got {low} to {high}")
     if low > high:
         raise UsageError(f"the end is before the start: {low} to {high}")
     if low == high:
@@ -168,7 +170,7 @@ class TimeSlice:
             return wanted
         return wanted & (at < end)
 
-    def missed_error(self, source: object, number: str = "data") -> UsageError:
+    def make_no_data_error(self, source: object, number: str = "data") -> UsageError:
         """Return the error to raise if a source has no data at the selected times.
 
         Args:
@@ -272,7 +274,7 @@ def iter_received(source: Transport, times: Times, name: object) -> Iterator[Chu
         if wanted.ended:
             break
     if wanted.first is not None and not any_came:
-        raise wanted.missed_error(name)
+        raise wanted.make_no_data_error(name)
 
 
 class ScanSelector:
@@ -284,7 +286,7 @@ class ScanSelector:
             whether it skipped data; None if the source cannot seek.
 
     Attributes:
-        ended: whether all selected scans have passed.
+        ended: whether no later scan can be selected.
         slice: the selected times.
     """
 
@@ -310,7 +312,10 @@ class ScanSelector:
         return self._utc.warnings if self._utc is not None else []
 
     def iter_selected(self, scans: Iterable[Scan | None]) -> Iterator[Scan | None]:
-        """Yield the selected parts of selected scans, and each None in the input.
+        """Yield the selected parts of selected scans, and every None.
+
+        Args:
+            scans: the scans of the stream. A None means that no scan has arrived for some time.
 
         Raises:
             UsageError: if there were scans, but none was selected.
@@ -326,7 +331,7 @@ class ScanSelector:
             if self.ended:
                 break
         if self.is_empty:
-            raise self.make_missing_error()
+            raise self.make_no_scan_error()
 
     def select(self, scan: Scan) -> Scan | None:
         """Return the selected parts of the next scan; None if it is not selected.
@@ -341,9 +346,9 @@ class ScanSelector:
         is_selected = start <= number and (stop is None or number < stop)
         self.ended = stop is not None and self._seen >= stop
         stamp_ns = scan.stamp_ns
-        if selection.is_timed or selection.time != "sensor":
+        if selection.has_time_limits or selection.time != "sensor":
             stamp_ns = self._find_time(scan)
-        if selection.is_timed:
+        if selection.has_time_limits:
             is_in_slice = bool(self.slice.select_times(np.array([stamp_ns]))[0])
             is_selected = is_selected and is_in_slice
             self.ended = self.ended or self.slice.ended
@@ -361,16 +366,16 @@ class ScanSelector:
         """Whether there were scans, but none was selected."""
         return self._seen > 0 and not self._selected
 
-    def make_missing_error(self) -> UsageError:
-        """Return the error to raise if no scan was selected."""
+    def make_no_scan_error(self) -> UsageError:
+        """Return the error to raise if the selection contains no scan."""
         if self._seen == 1:
             number = "1 scan"
         else:
             number = f"{self._seen} scans"
-        if self._selection.is_timed and self._has_skipped:
-            return self.slice.missed_error(self._source, "scans")
-        if self._selection.is_timed:
-            return self.slice.missed_error(self._source, f"{number},")
+        if self._selection.has_time_limits and self._has_skipped:
+            return self.slice.make_no_data_error(self._source, "scans")
+        if self._selection.has_time_limits:
+            return self.slice.make_no_data_error(self._source, f"{number},")
         return UsageError(
             f"{self._source} has {number}, from 0 to {self._seen - 1}; the selection is outside"
             " this range"
@@ -383,8 +388,8 @@ class ScanSelector:
         by_host = self._selection.time == "host"
         if not scan.host_ns and (by_host or scan.sensor.clock is None):
             error = UsageError(f"{self._source} has no arrival times")
-            if self._selection.is_timed and scan.sensor.clock is None:
-                raise suggest(error, "repeat with --scans 5:10")
+            if self._selection.has_time_limits and scan.sensor.clock is None:
+                raise suggest(error, "repeat with indices of scans, such as --scans 5:10")
             raise suggest(error, "repeat with --time sensor")
         if by_host:
             return scan.host_ns

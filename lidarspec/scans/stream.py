@@ -46,7 +46,8 @@ class ScanStream:
 
     Args:
         mount: the mount of the sensor; the scans are then in the axes of its carrier.
-        imu: the buffer of IMU samples. For each batch, add the samples before the packets.
+        imu: the buffer with the IMU samples. The caller adds the samples of each batch to this
+            buffer, and then calls `add` with the packets of the batch.
     """
 
     def __init__(
@@ -136,7 +137,7 @@ class ScanStream:
         self._uses_sector = True
 
     def _take_parts_with_points(self, packets: Packets) -> Packets:
-        """Return `packets`, or their parts if the parts have the points."""
+        """Return the packets with the points: `packets`, or the parts of their frames."""
         # The index of the parts has no gap for a frame without parts: no packet is missing.
         parts = packets.with_points
         if parts is not packets:
@@ -248,11 +249,13 @@ class ScanStream:
 def _read_starts(
     packets: Packets, points: EvaluatedPoints, indices: Sequence[int]
 ) -> list[ScanStart | None]:
-    """Return the starts of the scans that begin at some points.
+    """Return the start of each scan, given the index of its first point.
 
     Args:
-        indices: the indices of the first points of scans, ascending. For an index after the last
-            point, the result is None.
+        indices: the index of the first point of each scan, ascending.
+
+    Returns:
+        A `ScanStart` for each index; None for an index after the last point.
     """
     source = points.source
     known = [index for index in indices if index < source.size]
@@ -272,12 +275,15 @@ def iter_scans(
     """Yield all scans of one stream."""
     stream = ScanStream(sensor, imu=imu)
     for batch in batches:
-        yield from iter_released(stream.add(batch))
+        yield from pop_scans(stream.add(batch))
     yield from stream.finish()
 
 
-def iter_released(scans: list[Scan]) -> Iterator[Scan]:
-    """Yield scans, and keep no reference to a scan after it was yielded."""
+def pop_scans(scans: list[Scan]) -> Iterator[Scan]:
+    """Yield the scans of a list, and remove each of them from the list.
+
+    The memory of a scan can then be freed while the next scan is processed.
+    """
     scans.reverse()
     while scans:
         yield scans.pop()

@@ -188,7 +188,7 @@ class LiveScans:
         if not self._sieve.ended:
             self._store_scans(self._stream.finish())
         if self._sieve.is_empty:
-            raise self._sieve.make_missing_error()
+            raise self._sieve.make_no_scan_error()
 
     def _adjust_portion(self, packets: Packets, ahead: float) -> None:
         """Double or halve the number of bytes to read at a time, if necessary.
@@ -213,7 +213,7 @@ class LiveScans:
 
     def _select_packets(self, packets: Packets) -> Packets:
         """Return the packets whose times are in the selected range."""
-        if not self._select.is_timed:
+        if not self._select.has_time_limits:
             return packets
         is_selected = self._times.select_times(self._clock.read(packets))
         if is_selected.all():

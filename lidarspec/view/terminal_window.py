@@ -249,7 +249,7 @@ class Window:
         if self._record is None:
             recording = None
         else:
-            recording = self._record.recording
+            recording = self._record.current_file
         if recording is not None:
             return f"● {recording[0]}", ALARM
         if self.settings.paused:

@@ -182,6 +182,6 @@ def test_a_blocked_rotor_is_simulated_and_reported(tmp_path: Path) -> None:
     ran("sim", "ldrobot-ld06", "--rotor", "blocked", "--to", path, "-t", "1.5s")
     done = ran("convert", path, tmp_path / "points.csv", "-s", "ldrobot-ld06")
     assert (
-        "the angle does not pass 0 (azimuth): is the rotor blocked? No scan was completed within"
-        " 0.4 s" in " ".join(done.stderr.split())
+        "the angle 'azimuth' did not pass 0 within 0.4 s, so no scan was completed: is the rotor"
+        " blocked?" in " ".join(done.stderr.split())
     )

@@ -715,8 +715,7 @@ def test_a_blocked_rotor_is_reported() -> None:
         scans = list(itertools.islice(device.scans(wait=1.0), 3))
         assert [scan is not None and scan.complete for scan in scans] == [False] * 3
         said = (
-            "the angle does not pass 0 (azimuth): is the rotor blocked? No scan was completed"
-            " within"
-            " 0.4 s"
+            "the angle 'azimuth' did not pass 0 within 0.4 s, so no scan was completed: is the"
+            " rotor blocked?"
         )
         assert device.warnings == [f"sim:ldrobot-ld06?rotor=blocked&rate=max: {said}"]

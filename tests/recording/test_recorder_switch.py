@@ -49,7 +49,7 @@ def test_presses_at_once_leave_no_recording_open(tmp_path: Path) -> None:
     """An even number of presses ends with all files closed, and no file is empty."""
     switch = open_switch(tmp_path)
     press_at_once(switch)
-    assert switch.recording is None
+    assert switch.current_file is None
     assert not open_recordings(tmp_path)
     kept = {Path(path).name for path, _ in switch.written}
     assert {path.name for path in tmp_path.iterdir()} == kept
@@ -57,14 +57,14 @@ def test_presses_at_once_leave_no_recording_open(tmp_path: Path) -> None:
 
 def test_a_recording_of_nothing_is_removed_and_reported(tmp_path: Path) -> None:
     switch = open_switch(tmp_path)
-    switch.set(on=True)
-    assert switch.recording is not None
-    name, size = switch.recording
+    switch.set_state(on=True)
+    assert switch.current_file is not None
+    name, size = switch.current_file
     assert (size, [path.name for path in tmp_path.iterdir()]) == (0, [name])
-    switch.set(on=False)
-    assert (switch.recording, switch.written, list(tmp_path.iterdir())) == (None, [], [])
+    switch.set_state(on=False)
+    assert (switch.current_file, switch.written, list(tmp_path.iterdir())) == (None, [], [])
     assert switch.trouble == f"no data arrived for the recording {name}, so the file was removed"
-    switch.set(on=True)
+    switch.set_state(on=True)
     assert switch.trouble == ""
     switch.write(Chunk(b"data", 1))
     switch.close()

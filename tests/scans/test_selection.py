@@ -221,7 +221,7 @@ def test_bytes_without_times_have_no_slice(tmp_path: Path) -> None:
     source.write_bytes(b"".join(simulate(ls.sensor("cspc-coin-d4"), 500)))
     for selection, command in (
         (Selection(time="host"), "repeat with --time sensor"),
-        (Selection(times=(1.0, None)), "repeat with --scans 5:10"),
+        (Selection(times=(1.0, None)), "repeat with indices of scans, such as --scans 5:10"),
     ):
         with (
             ls.open(source, "cspc-coin-d4") as device,

@@ -141,7 +141,7 @@ class Broadcast:
     @property
     def can_seek(self) -> bool:
         """Whether the source is a file that supports seeking."""
-        return not self.is_live and not self._select.is_counted and self.source != "-"
+        return not self.is_live and not self._select.is_partial and self.source != "-"
 
     @property
     def state(self) -> str:

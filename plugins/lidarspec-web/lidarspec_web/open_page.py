@@ -215,7 +215,7 @@ class OpenPage:
         switch = self._broadcast.switch
         if switch is None:
             return "", ""
-        current = switch.recording
+        current = switch.current_file
         return current[0] if current is not None else "", switch.trouble
 
     def _find_unseen_scan(self) -> ShownScan | None:
@@ -382,7 +382,7 @@ class OpenPage:
             if on is None:
                 switch.toggle()
             else:
-                switch.set(on=on)
+                switch.set_state(on=on)
             self._broadcast.news()
 
         self._reply_later("record", change)

@@ -83,7 +83,7 @@ class PageMessages:
         warnings = list(broadcast.warnings)
         recording = None
         if switch is not None:
-            current = switch.recording
+            current = switch.current_file
             if current is not None:
                 recording = {"name": current[0], "bytes": current[1]}
             if switch.trouble:
