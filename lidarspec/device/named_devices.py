@@ -84,7 +84,9 @@ class NamedDevice:
             if self.is_trusted:
                 options = self.options
             else:
-                options = sensor.configure.options_of_file(self.options, Path(self.file).parent)
+                options = sensor.configure.check_untrusted_options(
+                    self.options, Path(self.file).parent
+                )
         except UsageError as error:
             raise self._suggest_trust(UsageError(f"{place}: {error}")) from None
         try:

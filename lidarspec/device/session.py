@@ -28,7 +28,7 @@ from lidarspec.framing.results import Found
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import OWN_ADDRESS, OWN_PORT, Address, Count, Port
 from lidarspec.spec.description import Command
-from lidarspec.spec.enum_values import EnumValue, find_code, name_value
+from lidarspec.spec.enum_values import EnumValue, find_code, to_enum_value
 from lidarspec.spec.options import Learned
 from lidarspec.spec.tree import FieldInfo
 
@@ -182,7 +182,7 @@ class ExpectedReply:
             if got[path] != expected[path]
         ]
         return [
-            f"{path} {value} instead of {name_value(table[path], expected[path])}"
+            f"{path} {value} instead of {to_enum_value(table[path], expected[path])}"
             for path, value in wrong
         ]
 

@@ -122,7 +122,7 @@ class Header:
         if not self.options:
             return installed
         try:
-            options = installed.configure.options_of_file(self.options, folder)
+            options = installed.configure.check_untrusted_options(self.options, folder)
             configured: Sensor = installed.configure(**options)
         except UsageError as error:
             raise UsageError(

@@ -121,20 +121,20 @@ def _add_step(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
     return replace(faults, steps=(*faults.steps, (start_s, size)))
 
 
-def _add_second(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
+def _add_double_pulse(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
     return _add_step(faults, value or "1s", start_s)
 
 
-def _repeat_second(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
+def _add_leap_second(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
     return _add_step(faults, value or "-1s", start_s)
 
 
-def _unlock(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
+def _add_unlocked_time(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
     end_s = start_s + parse_duration(value) if value else math.inf
     return replace(faults, unlocked=(*faults.unlocked, (start_s, end_s)))
 
 
-def _restart(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
+def _add_restart(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
     if value:
         raise UsageError(f"invalid restart={value}: expected only a time, as in restart@10s")
     return replace(faults, restarts=(*faults.restarts, start_s))
@@ -143,10 +143,10 @@ def _restart(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
 _READERS: dict[str, Callable[[ClockFaults, str, float], ClockFaults]] = {
     "drift": _add_drift,
     "step": _add_step,
-    "pps": _add_second,
-    "leap": _repeat_second,
-    "unlock": _unlock,
-    "restart": _restart,
+    "pps": _add_double_pulse,
+    "leap": _add_leap_second,
+    "unlock": _add_unlocked_time,
+    "restart": _add_restart,
 }
 
 
@@ -174,8 +174,10 @@ class ClockTimeline:
         """Move the time of power-on to a later time."""
         self._power_on_ns += delay_ns
 
-    def shift(self, readings: Times, times: Times, power_on_reading: int) -> Times:
-        """Return the readings of the clock with the faults, (n,) ns, not wrapped.
+    def apply_faults(self, readings: Times, times: Times, power_on_reading: int) -> Times:
+        """Return the readings of the clock with the faults, (n,) ns.
+
+        The readings are not wrapped: they may exceed the time at which the clock wraps.
 
         Args:
             readings: the readings without faults, (n,) ns.

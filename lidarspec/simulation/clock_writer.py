@@ -127,7 +127,7 @@ class ClockWriter:
 
     @property
     def can_follow_dates(self) -> bool:
-        """Whether a date determines the reading of the clock."""
+        """Whether the clock can follow a time scale: a date determines its reading."""
         return not self.period_ns or DAY_NS % self.period_ns == 0
 
     def read(self, table: CompiledTable) -> Times:
@@ -313,7 +313,7 @@ class FrameClock:
 
     @property
     def can_follow_dates(self) -> bool:
-        """Whether the clock can be set to a date."""
+        """Whether the clock can follow a time scale, such as UTC."""
         return self._writer is not None and self._writer.can_follow_dates
 
     def read_state(self, status: ClockStatus) -> ClockState:
@@ -342,8 +342,9 @@ class FrameClock:
             )
         if faults.follows and not self._writer.can_follow_dates:
             raise UsageError(
-                f"the clock of {self._sensor.id} cannot count {faults.follows.upper()}: it wraps"
-                f" at {self._writer.period_ns / 1e9:g} s, and a day is not a multiple of this time"
+                f"the clock of {self._sensor.id} cannot follow {faults.follows.upper()}: it wraps"
+                f" at {self._writer.period_ns / 1e9:g} s, and a day is not a multiple of this"
+                " time, so a date does not determine the reading of the clock"
             )
 
     def check_status(self) -> None:
@@ -360,7 +361,9 @@ class FrameClock:
         if timeline.is_perfect:
             return
         if self._writer is not None:
-            readings = timeline.shift(self._writer.read(table), times, self._power_on_reading)
+            readings = timeline.apply_faults(
+                self._writer.read(table), times, self._power_on_reading
+            )
             self._writer.write(table, readings)
             if timeline.faults.follows:
                 self._write_dates(table, readings)
@@ -431,7 +434,7 @@ class StatusWriter:
         read: returns the readings of the clock in frames, (n,) ns; None if they have no clock.
 
     Raises:
-        UsageError: if no values of the fields give a locked and an unlocked status.
+        UsageError: if the fields have no value for a locked clock, or none for an unlocked clock.
     """
 
     def __init__(
@@ -566,7 +569,10 @@ def _shift_raw(
 
 
 def _get_encoding(info: FieldInfo) -> tuple[str, float, float, int, str]:
-    """Return the properties that are the same for all time fields of one clock."""
+    """Return (unit, scale, offset, bits, kind) of a field.
+
+    The time fields of one clock have the same values.
+    """
     return info.unit, info.scale, info.offset, info.bits, info.kind
 
 

@@ -136,7 +136,8 @@ class ReplyMaker:
     """Makes the replies of one sensor to its commands.
 
     Args:
-        shake: standard deviation of the noise on IMU measurements, m/s2 and rad/s.
+        shake: standard deviation of the noise on IMU measurements, in m/s2 for accelerations and in
+            rad/s for angular rates.
 
     Attributes:
         data_port: the port at which the simulated sensor serves its data; 0 for none.
@@ -256,7 +257,7 @@ def _make_command_decoder(sensor: Sensor, link: str) -> Decoder:
 
 @functools.lru_cache(maxsize=256)
 def _make_incoming(frame: Frame) -> Frame:
-    """Return an outgoing frame type as an incoming type, to parse commands."""
+    """Return a frame type that the host sends, as a type that a decoder accepts."""
     return replace(frame, direction="in")
 
 
@@ -383,7 +384,7 @@ class SimulatedDevice:
         sent: number of sent frames by type, before faults.
         lines: the links with their faults, by name.
         utc_offset_ns: UTC minus the time that the caller passes, ns; None if the sensor sends the
-            dates of the spec's `sweep`. A change takes effect at the next `start`.
+            dates that its `Simulation.sweep` returns. A change takes effect at the next `start`.
 
     Raises:
         UsageError: if the sensor declares no `sweep`, or if its clock cannot have the faults.
@@ -476,8 +477,8 @@ class SimulatedDevice:
         opening = [self.sensor.commands[name] for name in self.sensor.on_open]
         return any(command.starts and command.frame for command in opening)
 
-    def serve_at(self, data_port: int) -> None:
-        """Set the port at which the data is served, which some replies report."""
+    def set_data_port(self, data_port: int) -> None:
+        """Set the port that replies report as the port of the data."""
         self._replies.data_port = data_port
 
     def unplug(self) -> None:
@@ -502,7 +503,7 @@ class SimulatedDevice:
         self._replies.use_timeline(self._timeline)
 
     def delay_output(self, seconds: float, now: int) -> None:
-        """Hold back all data for `seconds`, and then send it at once."""
+        """Hold back all data for `seconds`, and then send all of it in one burst."""
         self._late_until = now + round(seconds * SECOND)
 
     def receive(self, data: bytes, now: int, link: str = "data") -> None:
@@ -513,16 +514,17 @@ class SimulatedDevice:
                 self._reply(request, self._find_device_time(now))
 
     def outgoing(self, now: int) -> list[tuple[str, bytes]]:
-        """Return the data that is due until `now`, in order, as (link, bytes).
+        """Take out the data that is due until `now`, and return it as (link, bytes).
 
-        All bytes of a byte stream are one entry. Each datagram is an entry.
+        The list has an item for each datagram, and one item with all bytes of each byte stream.
         """
         return [(link, data) for link, _, data in self.outgoing_with_types(now)]
 
     def outgoing_with_types(self, now: int) -> list[tuple[str, str, bytes]]:
-        """Return the data that is due until `now`, as (link, frame type, bytes).
+        """Take out the data that is due until `now`; return it as (link, frame type, bytes).
 
-        All bytes of a byte stream are one entry, with the type "".
+        The list has an item for each datagram. All bytes of a byte stream are one item, with the
+        type "".
         """
         self._switch_plug(now)
         if not self.present:
@@ -555,7 +557,7 @@ class SimulatedDevice:
 
     @property
     def deadline(self) -> int | None:
-        """The time of the next output, disconnection or reconnection; None if unknown."""
+        """The time of the next output, disconnection or reconnection; None without one."""
         times = [self._plug] if self._plug is not None else []
         if self.present:
             due = [self._plan[0].at] if self._plan else []

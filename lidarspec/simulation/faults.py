@@ -1,7 +1,7 @@
 """Inject faults into the data of a simulated sensor.
 
 The faults are corrupt bytes, lost and reordered packets, disconnections, a blocked rotor, IMU noise
-and faults of the clock. The seed and the packets determine the faults.
+and faults of the clock. The same seed and the same packets give the same faults.
 """
 
 from __future__ import annotations
@@ -32,10 +32,11 @@ class Faults:
             inserted.
         loss: fraction of packets to drop, 0 to 1.
         reorder: maximum delay of a datagram, in packets; 0 for no delay.
-        unplug: time before each disconnection, in seconds; 0 for no disconnection.
+        unplug: how long the device stays connected before each disconnection, in seconds; 0 for no
+            disconnection.
         absent: duration of each disconnection, in seconds.
-        shake: standard deviation of the noise on IMU measurements, in m/s2 and rad/s; 0 for no
-            noise.
+        shake: standard deviation of the noise on IMU measurements, in m/s2 for accelerations and in
+            rad/s for angular rates; 0 for no noise.
         clock: the faults of the sensor's clock.
         rotor: "blocked" if the rotor does not turn and the angles are constant; "" if it turns.
 

@@ -41,7 +41,8 @@ class FrameMaker:
         engine = get_codec(sensor.frames[frame])
         if isinstance(engine, PlainCodec):
             raise SpecError(
-                f"cannot be simulated, because it is not compiled: {engine.reason}",
+                "cannot be simulated, because lidarspec cannot compile this frame type:"
+                f" {engine.reason}",
                 path=frame,
                 sensor=sensor.id,
             )
@@ -72,7 +73,7 @@ class FrameMaker:
         Args:
             sensor: id of the sensor, for messages.
             limit: maximum length of a frame, in bytes.
-            given: raw values of the fields of the frame on which the parts depend.
+            given: raw values, by path, of those fields of the frame that the parts depend on.
         """
         maker = cls.__new__(cls)
         maker._coder = None  # only whole frames have a wire form
@@ -142,10 +143,12 @@ class FrameMaker:
         return self.seal(self.table([values]))[0]
 
     def seal(self, table: CompiledTable) -> list[bytes]:
-        """Return the bytes of the frames of a table, as they are sent.
+        """Fill in constants and checksums; return the bytes of each frame as it is sent.
+
+        If the frame type has a wire form (`Frame.wire`), the bytes are encoded in this form.
 
         Raises:
-            SpecError: if the wire form cannot write a value.
+            SpecError: if the wire form cannot encode a value.
         """
         structs = seal_frames(table)
         if self._coder is None:
@@ -155,7 +158,8 @@ class FrameMaker:
             data = self._coder.encode(struct)
             if data is None:
                 raise SpecError(
-                    f"the wire form {self.engine.frame.wire} cannot encode the simulated values",
+                    f"wire={self.engine.frame.wire} of the frame cannot encode the simulated"
+                    " values",
                     path="simulation",
                     sensor=self._sensor,
                 )
@@ -336,7 +340,10 @@ def set_nested(values: dict[str, Any], path: str, value: Any) -> None:
 
 
 def seal_frames(table: CompiledTable) -> list[bytes]:
-    """Return the bytes of the frames of a table, with constants and checksums."""
+    """Fill in the constants and checksums of a table; return the bytes of each frame.
+
+    The bytes are those of the struct, before a wire form encodes them.
+    """
     frames = [b""] * len(table)
     for group in table.groups:
         group.layout.seal(group.rows)

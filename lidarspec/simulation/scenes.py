@@ -42,7 +42,7 @@ ORIGIN: Vector = (0.0, 0.0, 0.0)
 
 
 class Scene(Protocol):
-    """A scene in which ranges can be measured."""
+    """The interface of a scene: any object with this `measure` can be used as a scene."""
 
     def measure(
         self, azimuth: Floats, elevation: Floats, origin: Vector = ORIGIN, time: Value = 0.0
@@ -64,8 +64,11 @@ class Box:
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
-    def at(self, time: Value) -> tuple[Vector, Vector]:
-        """Return the lowest and the highest corner in metres; `time` is ignored."""
+    def find_corners(self, time: Value) -> tuple[Vector, Vector]:
+        """Return the lowest and the highest corner in metres.
+
+        The box does not move, so `time` has no effect; `Mover` has the same method.
+        """
         return self.low, self.high
 
     @property
@@ -90,7 +93,7 @@ class Mover:
     speed: float = 0.8
     floor: float = -1.2
 
-    def at(self, time: Value) -> tuple[Vector, Vector]:
+    def find_corners(self, time: Value) -> tuple[Vector, Vector]:
         """Return the lowest and highest corner at a time, in metres.
 
         x and y have the shape of `time`; z is a number.
@@ -166,7 +169,7 @@ def _shorten_ranges(
     ranges: Floats, body: Box | Mover, beams: Vector, origin: Vector, time: Value
 ) -> None:
     """Reduce the ranges of beams that hit the outside of a body, in place."""
-    low, high = body.at(time)
+    low, high = body.find_corners(time)
     near = _may_hit(body, low, high, beams, origin)
     where = np.flatnonzero(np.broadcast_to(near, ranges.shape))
     if not len(where):

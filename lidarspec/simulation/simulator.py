@@ -8,8 +8,9 @@ Packets are made in four steps:
 4. `Measurement` writes the ranges into the range fields. `PointPlacement` writes the coordinates of
    Cartesian points.
 
-To find the points that depend on a field, each field in metres is set to a probe value. If the
-sensor declares a function `encode`, this function returns the values of the fields instead.
+The range fields are found by probing: each field in metres is set to a probe value, and the points
+that then have this range belong to the field. If the sensor declares a function `encode`, nothing
+is probed: `encode` converts the ranges to the values of the fields.
 """
 
 from __future__ import annotations
@@ -82,7 +83,8 @@ class RangeField:
 
     Attributes:
         path: path of the field.
-        inner: an index into the axes that the points have in addition to the axes of the field.
+        inner: the index of the field's points on the axes that the points have and the field does
+            not, for example an axis of returns; () if there are no such axes.
         step: metres per raw step; None if it differs between packets.
         zero: range of the raw value 0, metres.
     """
@@ -154,7 +156,7 @@ class Measurement:
     def of(
         cls, sensor: Sensor, frame: str, table: CompiledTable, given: Container[str]
     ) -> Measurement:
-        """Return a `PointPlacement` for Cartesian points, else a `Measurement`."""
+        """Return a `Measurement`, or a `PointPlacement` if the points are Cartesian."""
         result, _ = _evaluate_points(sensor, frame, table)
         if isinstance(result, Cartesian):
             return PointPlacement(sensor, frame, table, given)
@@ -284,7 +286,11 @@ class Measurement:
         return min(most, *(form.largest(leaf.size) for leaf in leaves))
 
     def _trace_targets(self, table: CompiledTable) -> tuple[RangeField, ...]:
-        """Return the fields that the ranges of the points depend on."""
+        """Return the fields into which the ranges of the points are written.
+
+        They are the fields in metres that are a range of a point. If there are none, the fields of
+        `_find_linear_fields` are returned.
+        """
         targets: list[RangeField] = []
         for path, info in table.schema.fields.items():
             if factor(info.unit, "m") is None or not any(
@@ -305,14 +311,14 @@ class Measurement:
         targets = targets or self._find_linear_fields(table)
         if not targets:
             reason = (
-                "cannot set the range of a point, because no field in metres determines it:"
-                " declare `encode`"
+                f"{self._frame!r} frames cannot be simulated, because no field contains only the"
+                " range of a point: declare Simulation(encode=...)"
             )
             raise SpecError(reason, path="points", sensor=self._sensor.id)
         return tuple(targets)
 
     def _find_linear_fields(self, table: CompiledTable) -> list[RangeField]:
-        """Return the fields that `points` converts to ranges by a linear function."""
+        """Return the fields from which `points` calculates ranges by a linear function."""
         targets = []
         for path, info in table.schema.fields.items():
             metres = factor(info.unit, "m") is not None
@@ -471,7 +477,10 @@ class PointPlacement(Measurement):
         return [each.positions for each in beams if each.positions is not None]
 
     def _trace_targets(self, table: CompiledTable) -> tuple[RangeField, ...]:
-        """Return the fields that the coordinates depend on linearly."""
+        """Return the fields into which the coordinates of the points are written.
+
+        The coordinates have to be a linear function of each of these fields.
+        """
         targets = []
         for path, info in table.schema.fields.items():
             metres = not info.unit or factor(info.unit, "m") is not None
@@ -495,8 +504,8 @@ class PointPlacement(Measurement):
                     targets.append(RangeField(path, inner, None))
         if not targets:
             reason = (
-                "cannot set the coordinates of a point, because no field determines them: declare"
-                " `encode`"
+                f"{self._frame!r} frames cannot be simulated, because the coordinates of points are"
+                " not a linear function of any field: declare Simulation(encode=...)"
             )
             raise SpecError(reason, path="points", sensor=self._sensor.id)
         return tuple(targets)
@@ -535,7 +544,8 @@ def _evaluate_points(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[
     measured = [getattr(result, name, None) for name in ("range", "x", "y", "z")]
     if not any(isinstance(part, Column) for part in measured):
         raise SpecError(
-            "cannot be simulated, because no field determines the range of a point",
+            f"{frame!r} frames cannot be simulated, because `points` calculates neither ranges nor"
+            " coordinates from fields",
             path="points",
             sensor=sensor.id,
         )
@@ -983,7 +993,7 @@ def _iter_due(name: str, rate: float) -> Iterator[tuple[float, str, int]]:
 
 @functools.lru_cache(maxsize=64)
 def frame_simulation(sensor: Sensor, frame: str, *, blocked: bool = False) -> FrameSimulation:
-    """Return the cached simulation of a data frame type."""
+    """Return the `FrameSimulation` of a data frame type, which is made only once."""
     return FrameSimulation(sensor, frame, blocked=blocked)
 
 

@@ -28,8 +28,8 @@ class Range:
 class Port(Range):
     """The UDP port to which the sensor sends its data.
 
-    As an argument, it is a number. Among the `values` of a command, it is the port at which this
-    computer expects the data.
+    In `Command.args`, it is the type of an argument, which is a port number. In `Command.values`,
+    it stands for the port at which this computer expects the data.
     """
 
     low: float = 1
@@ -180,7 +180,11 @@ class Count:
             )
 
     def at(self, index: int) -> int:
-        """Return the running number of the command with an index, which starts at 0."""
+        """Return the running number of a command.
+
+        Args:
+            index: the number of commands that were sent before this command.
+        """
         return (self.first + index) % (1 << self.bits)
 
 

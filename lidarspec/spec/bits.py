@@ -47,10 +47,11 @@ class BitField:
 
     @cached_property
     def run(self) -> tuple[str, int, int, int] | None:
-        """The position of the value, if its bits are consecutive in an integer; else None.
+        """The run of consecutive bits of an integer that is the value; None if there is none.
 
-        The items are the byte order of the integer ("<" or ">"), its first byte, its number of
-        bytes, and the lowest bit of the value in the integer.
+        The run is a tuple (byte order, first byte, number of bytes, lowest bit). The first three
+        items describe the integer: "<" or ">", the index of its first byte in the block, and its
+        size. The last item is the bit of the integer at which the value begins.
         """
         parts = sorted(self.segments, key=lambda part: part.byte)
         first = parts[0].byte
@@ -145,7 +146,7 @@ def _make_field(
     """
 
     def find_index(position: int) -> int:
-        """Return the index of the bit of the block that is at this position of the value."""
+        """Return which bit of the block is bit number `position` of the value."""
         return sum((value >> position & 1) << bit for bit, value in enumerate(values))
 
     signed = full == -1

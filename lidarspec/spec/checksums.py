@@ -1,8 +1,9 @@
-"""Checksum algorithms as values, and the CRCs in common use by name.
+"""Checksum algorithms as values, and a table of common CRCs.
 
-An algorithm is immutable and hashable, and equal to another algorithm with the same parameters. It
-is called with the bytes of one message. `make_single` returns a faster function. `CRCS` has the
-common CRCs, by the names of CRC catalogues.
+An algorithm is immutable and hashable, and equal to another algorithm with the same parameters. An
+algorithm is called with the bytes of one message, and returns the checksum. `make_single` returns a
+function that computes the same checksum faster. `CRCS` contains common CRCs under the names that
+CRC catalogues use.
 """
 
 from __future__ import annotations
@@ -165,12 +166,15 @@ class Sum(Checksum):
 
 @dataclass(frozen=True)
 class WordXor(Checksum):
-    """The 16-bit XOR of words of one or two bytes, low byte first.
+    """The 16-bit XOR of words of one or two bytes.
+
+    A word of two bytes is little-endian.
 
     Args:
-        head: the number of bytes at the start that form two-byte words.
-        groups: the sizes of the following words, 1 or 2 bytes each. The sequence of sizes is
-            repeated. A single byte at the end of the data is a word.
+        head: the number of bytes at the start of the data that are read as words of two bytes.
+        groups: the sizes (1 or 2 bytes) of the words after the head. The sequence of sizes is
+            repeated up to the end of the data. If only one byte is left at the end, this byte is a
+            word.
 
     Raises:
         ValueError: for invalid sizes.

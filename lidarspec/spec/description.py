@@ -80,8 +80,9 @@ class Simulation:
     Args:
         sweep: a function of the frame number i that returns the physical values, by path, of fields
             that do not depend on the scene, such as angles, counters and time.
-        encode: a function that gets the simulated points of a batch as `Polar`, and returns the raw
-            values of the fields, by path. Needed if there is no field that contains only the range.
+        encode: a function that takes the simulated points of n frames as `Polar`, and returns the
+            raw values of the fields, by path. Needed if no field contains only the range of a
+            point.
         rate: the number of frames per second. Data frames need it only if it does not follow from
             the clock or from the times of the points. Other frames need it if the sensor sends them
             periodically.
@@ -96,8 +97,9 @@ class Simulation:
             points of the frame, radians, as two arrays that broadcast to the points of a frame.
             Needed for `Cartesian` points.
         effects: for each command, a function that returns the sweep to use after the command. The
-            arguments of the function are the sweep so far and the number of the next frame. The new
-            sweep counts frames from 0. Only for a sensor, not for a frame type.
+            arguments of the function are the current sweep, and the number that the next frame
+            would have in this sweep. In the new sweep, the next frame has the number 0. Only for a
+            sensor, not for a frame type.
         date: a function of seconds since 1970 that returns physical values, by path, of fields that
             contain a date in addition to the clock, such as an NMEA sentence. It is used if the
             simulated clock follows UTC.
@@ -135,13 +137,13 @@ class Frame:
             fixed.
         plausible: a function of `Fields` that is False for values that no sensor sends. A packet is
             plausible if all values of the result are true.
-        after: the name of another frame type that announces this frame type. Frames of this type
-            are then accepted until a frame announces another type.
+        after: the name of another frame type, which announces frames of this type. Frames of this
+            type are accepted only after such a frame, until a frame announces another type.
         confirm: the number of consecutive valid frames of this type that must arrive before any of
             them is accepted.
         simulation: facts for the simulation of this frame type. Needed if the sensor has several
-            data frames, if random values never make a valid frame, or if the sensor sends this
-            frame periodically.
+            data frames, if `Sensor.example` cannot make a valid frame from random values, or if the
+            sensor sends this frame periodically.
         acknowledged: the reasons why findings of `lidarspec check` are accepted, by finding. A
             finding is a code such as "LS204", or a code and the path of a field, such as "LS205
             path.of.a.field".
@@ -273,8 +275,9 @@ class Command:
         stops: whether the sensor stops sending data.
         only_stopped: whether the sensor ignores the command while it sends data.
         learns: a function of the reply, as `Sensor.parse` returns it, that returns options for
-            `configure` by name. Their values are numbers, bytes or texts; bytes and texts become
-            `Learned`. The options are applied if the command is in `on_open`.
+            `configure` by name. Their values are numbers, bytes or texts; `configure` receives
+            bytes and texts as `Learned`. The options are applied only if the command is in
+            `on_open`.
         provides: a function of the reply, as for `learns`, that returns numbers and texts by name.
             Later commands use them in a `Template`, and a link may use them (`Tcp(reported=)`). If
             the function raises ValueError, the command fails with the text of this error.

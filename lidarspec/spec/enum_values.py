@@ -6,7 +6,7 @@ from typing import Any
 
 from lidarspec.spec.tree import FieldInfo
 
-#: named numbers below this are shown in decimal, others in hexadecimal, as in most manuals.
+#: named raw values below this are shown in decimal, others in hexadecimal, as in most manuals.
 FIRST_HEX_CODE = 10
 
 #: the text after a number that has no name.
@@ -39,21 +39,21 @@ class EnumValue(int):
 
 
 def format_code(raw: int, name: str) -> str:
-    """Return a named number as text, for example "idle (1)" or "strongest (0x37)"."""
+    """Return a raw value and its name as text: "idle (1)" or "strongest (0x37)"."""
     if 0 <= raw < FIRST_HEX_CODE:
         return f"{name} ({raw})"
     return f"{name} ({raw:#x})"
 
 
-def name_value(info: FieldInfo, value: Any) -> Any:
-    """Return a raw value as `EnumValue` if its field has an Enum, else unchanged."""
+def to_enum_value(info: FieldInfo, value: Any) -> Any:
+    """Return a raw value as an `EnumValue` if its field has an Enum, else unchanged."""
     if info.labels and isinstance(value, int):
         return EnumValue(value, info.labels.get(value, ""))
     return value
 
 
 def find_code(info: FieldInfo, value: Any) -> Any:
-    """Return the raw value for a name in a field's Enum; other values unchanged."""
+    """Return the raw value of a name in the field's Enum; other values unchanged."""
     if isinstance(value, str):
         return next((raw for raw, name in info.labels.items() if name == value), value)
     return value

@@ -214,8 +214,8 @@ class Checksummed(layer.SealedStruct):
         algorithm: the `Checksum`; if None, a ``lidarspec_checksum`` hook has to return it.
         over: the names of consecutive fields that the checksum covers. By default, it covers all
             bytes of the struct, except bytes that contain a bit of `field`.
-        absent: the values of the field that mean that the sensor has computed no checksum. They are
-            valid, and are kept when a frame is built.
+        absent: the values of the field that mean that the sensor has computed no checksum. A frame
+            with such a value is valid. `build` does not replace such a value by a checksum.
     """
 
     def __init__(
@@ -257,7 +257,7 @@ class Checksummed(layer.SealedStruct):
             return obj
         stream.seek(start)
         data = stream.read(end - start)
-        stored, computed = self.verdict(data, obj, start)
+        stored, computed = self.find_checksums(data, obj, start)
         if stored != computed and stored not in self.absent:
             name = self.fields[0]
             width = (sum(layer.bit_width(self._find_field(name)) for name in self.fields) + 3) // 4
@@ -297,7 +297,7 @@ class Checksummed(layer.SealedStruct):
             return self.subcon
         return layer.prepare(self.subcon)
 
-    def verdict(self, data: bytes, obj: Any, base: int = 0) -> tuple[int, int]:
+    def find_checksums(self, data: bytes, obj: Any, base: int = 0) -> tuple[int, int]:
         """Return the stored and the computed checksum of one parsed struct.
 
         Args:

@@ -62,8 +62,8 @@ class Assembled:
             as a counter. Any 16 consecutive messages must have different keys.
         index: the path of the field with the index of the fragment in its message.
         count: the path of the field with the number of fragments of the message.
-        payload: the path of the bytes that belong to the message; "" if they are all bytes after
-            the struct.
+        payload: the path of the field with the fragment of the message; "" if the fragment is
+            everything after the struct.
         first: the index of the first fragment.
         in_bytes: whether `index` is the offset of the fragment in the message, and `count` is the
             size of the message, in bytes.

@@ -25,10 +25,10 @@ MAX_LEARNED_BYTES = 1 << 20
 
 
 class Learned(bytes):
-    """Bytes from a sensor, as the value of an option that is usually a file.
+    """The content of a file, received from a sensor, as the value of an option.
 
-    An option accepts this type if its annotation contains it, as in ``calibration: str | Path |
-    Learned``.
+    The option usually takes the path of such a file. It also accepts this type if its annotation
+    contains the type, as in ``calibration: str | Path | Learned``.
     """
 
     def __repr__(self) -> str:
@@ -40,7 +40,7 @@ class Learned(bytes):
 
     @classmethod
     def of_dict(cls, data: Mapping[str, Any]) -> Learned:
-        """Return the content that `to_dict` wrote.
+        """Return the `Learned` from which `to_dict` made the data.
 
         Raises:
             UsageError: if the data is invalid, or has more than a megabyte of content.
@@ -57,7 +57,7 @@ class Learned(bytes):
 
     @classmethod
     def content(cls, value: str | PathLike[str] | Learned) -> bytes:
-        """Return the content of the file at a path, or learned content unchanged.
+        """Return the content of the file at a path, or the bytes of a `Learned`.
 
         Raises:
             UsageError: for a file that cannot be read.

@@ -127,8 +127,8 @@ class SensorDescription:
     def data_frame(self) -> str:
         """The name of the frame type with the points.
 
-        If several frame types have points, the option `answer` selects one; the default is the
-        first.
+        If several frame types have points, the option `answer` of `configure` has the name of the
+        type that the sensor sends. The default is the first type.
 
         Raises:
             UsageError: for a sensor without points.
@@ -270,7 +270,7 @@ class SensorDescription:
 
     @cached_property
     def datagrams(self) -> bool:
-        """Whether the data link sends one frame per datagram."""
+        """Whether data arrives in datagrams, and not as a byte stream."""
         return is_datagram(self.links.get("data"))
 
     @property
@@ -285,7 +285,10 @@ class SensorDescription:
 
     @property
     def counts_losses(self) -> bool:
-        """Whether lost packets are counted, by a counter or a clock with a declared pace."""
+        """Whether lost packets can be counted.
+
+        This requires a packet counter, or a clock that declares the time between packets (`pace`).
+        """
         if self.sequence is not None:
             return True
         return self.clock is not None and self.clock.pace is not None
@@ -301,7 +304,7 @@ class SensorDescription:
 def with_frames(sensor: _Sensor, frames: Mapping[str, Frame]) -> _Sensor:
     """Return a copy of a sensor with only these frame types.
 
-    The copy has no commands, no `state` and no `info`.
+    The copy has no commands, no `state` and no `info`, because they may refer to other frame types.
     """
     clock = sensor.clock
     if clock is not None and clock.reference is not None and clock.reference[0] not in frames:
@@ -338,14 +341,18 @@ def _check_sensor(sensor: SensorDescription) -> None:
 
 def _check_reported(sensor: SensorDescription, name: str) -> None:
     """Raise `SpecError` if the sensor cannot report the port of a link."""
-    if name != "data" or not any(
+    if name != "data":
+        raise SpecError(
+            "only the data link may have `reported`", path=f"links.{name}", sensor=sensor.id
+        )
+    if not any(
         sensor.commands[opening].provides and sensor.commands[opening].link != "data"
         for opening in sensor.on_open
         if opening in sensor.commands
     ):
         raise SpecError(
-            "only the data link may have port=`reported`. A command in `on_open` that is sent over"
-            " another link must provide the port",
+            "`reported` requires a command in `on_open` that provides the port, and is sent over"
+            " another link",
             path=f"links.{name}",
             sensor=sensor.id,
         )
@@ -390,7 +397,8 @@ def _check_facts(sensor: SensorDescription) -> None:
     for name, frame in sensor.frames.items():
         if frame.endless is not None and not _comes_in_datagrams(sensor, frame):
             raise SpecError(
-                f"{frame.endless.reason}. A frame without an end must be sent as a datagram",
+                f"{frame.endless.reason}. Such a frame cannot be found in a byte stream, and"
+                " requires a link with datagrams",
                 path=f"{name}.{frame.endless.path}".strip("."),
                 sensor=sensor.id,
                 rule=frame.endless.rule,
@@ -456,8 +464,8 @@ def _check_command(sensor: SensorDescription, name: str, command: Command) -> No
         raise SpecError("provides requires a reply", path=f"commands.{name}.provides")
     if command.needed and not any(other.provides for other in sensor.commands.values()):
         raise SpecError(
-            f"the value {min(command.needed)!r} is unknown: no argument has this name, and no"
-            " command has `provides`",
+            f"the name {min(command.needed)!r} in a template is unknown: the command has no such"
+            " argument, and no command has `provides`",
             path=f"commands.{name}.values",
             sensor=sensor.id,
         )
@@ -480,7 +488,8 @@ def _check_clock(sensor: SensorDescription) -> None:
     _check_names(sensor, "clock.reference", clock.reference[:1], sensor.frames)
     if clock.wraps_at is None or callable(clock.source):
         raise SpecError(
-            "`reference` requires a clock that consists of fields and has `wraps_at`",
+            "Clock(reference=...) requires `wraps_at`, and a clock that is read from fields, not by"
+            " a function",
             path="clock.reference",
             sensor=sensor.id,
         )
@@ -548,11 +557,11 @@ class Configure:
         """Return whether an option accepts a value; True if the option is unknown."""
         return self.types.get(name, OptionType()).accepts(value)
 
-    def options_of_file(self, options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-        """Check the options of an untrusted file, and return them with whole paths.
+    def check_untrusted_options(self, options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+        """Check the options of an untrusted file, and return them as Python values.
 
-        Valid values are numbers, words, learned content, and paths of files in `folder` or below
-        it.
+        Valid values are numbers, words, the data of a `Learned`, and paths of files in `folder` or
+        below it. In the result, these paths begin with `folder`.
 
         Raises:
             UsageError: for a path outside the folder, or a value of another kind.

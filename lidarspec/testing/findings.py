@@ -35,13 +35,13 @@ LS006 the list of sensors cannot be read | all sensors of this hook are missing 
 LS007 the declaration is invalid | the sensor is refused when it is declared | correct it as the message says
 LS008 sizeof is used on an optional part | construct raises KeyError for If and Switch | write the longest length as a number
 LS009 the longest length of the frame is unknown | a damaged length would block the decoder | declare max_length= of the Frame, in bytes
-LS010 the hook raises an error | its result is missing | return None for unknown arguments
+LS010 the hook raises an error | its result is missing | return None for arguments that the hook does not know
 LS101 construct hides this field name | `parsed.items` is a method of the Container | choose another name
 LS102 the field name is reserved | `f.state` and `column.on` have another meaning in `points` | choose another name
 LS103 the field name is not a public identifier | == ignores names that begin with _ | choose an identifier without a leading _
 LS104 two fields have the same name | the last one replaces the others | number the names: reserved_1, reserved_2
 LS105 the field has no name | its bytes are lost when a parsed frame is built again | declare "reserved" / Bytes(n)
-LS106 bytes of a part are lost | a parsed frame that is built again has other bytes
+LS106 the parsed value does not contain all bytes of a part | a parsed frame that is built again has other bytes
       | end the part with "rest" / GreedyBytes, or make it a named member of a Struct
 LS107 Flag is used for a whole byte | seven of its bits are lost when a parsed frame is built again | declare all eight bits in a BitStruct
 LS108 the struct contains FlagsEnum | bits without a name are lost when a parsed frame is built again | use a BitStruct
@@ -52,19 +52,20 @@ LS111 a field is greedy | nothing marks its end in a stream, or its elements may
 LS112 the struct contains Pointer or Seek | they read bytes outside the frame | declare fields in the order of the wire
 LS113 the struct contains Select or Optional | damaged bytes would select another alternative | use If or Switch on a header field
 LS114 the frame is not a Struct | Const(...).build({}) fails | use Struct("header" / Const(...))
-LS115 an expression of the struct fails | it raises an undocumented exception | make it valid for every header
+LS115 an expression in the struct raises an error | the error is not one that lidarspec documents
+      | write the expression so that it works for all values of the header fields
 LS116 the frame is not compiled | construct parses it, hundreds of times slower | declare fields whose offsets follow from the header
 LS117 a field with named values is compared with a number | construct compares the name, so the result is always the same | compare with the name
-LS201 a measured value has no unit | users cannot tell metres from millimetres | use Scaled(Int16ul, 0.001, "m"); "" is a pure number
+LS201 a measured value has no unit | users cannot tell metres from millimetres | use Scaled(Int16ul, 0.001, "m"), with the unit "" for a number without a unit
 LS202 the sensor has no source | readers cannot verify its numbers | declare source="manual, revision, section"
 LS203 max_length is not the longest length | valid frames are refused, or the decoder waits too long | declare the size of the longest frame
 LS204 the sync pattern is common | false candidates cost time and valid frames | declare more constant bytes or bits
 LS205 the checksum does not cover a field | a flipped bit in the field is not detected | add it to over=, or omit over=
 LS206 noise may be accepted as this frame | it becomes false points | declare plausible= or confirm=
-LS207 `plausible` does not test columns | an expression of construct is always true | use plausible=lambda f: f.angle < 360
+LS207 `plausible` returns a constant or an expression of construct | an expression of construct is always true | use plausible=lambda f: f.angle < 360
 LS208 `points` cannot be compiled | it runs as ordinary NumPy, ten times slower | use ufuncs and functions of lidarspec.spec
 LS209 an acknowledgement matches no finding, or has no reason | it would hide the next such finding | remove it, or give a reason
-LS210 the field cannot hold the range limit | the scale or the limit is wrong | compare both with the manual
+LS210 range_limits exceed the largest value of the range field, or are invalid | the scale or the limit is wrong | compare both with the manual
 LS211 the declaration is incomplete | lidarspec cannot open, decode or detect the sensor | declare vendor, model, a data frame and a data link
 LS212 the checksum is not verified | damaged frames are accepted
       | use Checksummed (`lidarspec crc` finds the algorithm), or "crc" / Int16ul * "not checked: ..."
@@ -78,11 +79,12 @@ LS216 no data frame has this field | the scans, the clock or the counter need it
 LS217 the option changes nothing | users who set it get the same points | use it in `configure`, or remove it
 LS218 the intensity is calculated from another field | users expect the intensity that the sensor measured
       | use the intensity field
-LS219 the range is calculated from a code | error codes become points | use the distance field
+LS219 the range is calculated from a field whose name suggests a code | error codes become points | use the distance field
 LS301 no example can be generated | the frame cannot be tested
       | declare Simulation(sweep=...), or strategies = {"frame.field": ...} in the test class
 LS302 parsing and building change the bytes | a replayed or edited frame differs | use fields that keep every bit
-LS303 a value is truncated, not rounded | int() loses a step if the float is slightly too small | use Scaled or round()
+LS303 building truncates a value instead of rounding it | int() loses a step if the float is slightly too small
+      | use Scaled, or round() in the function that encodes the value
 LS304 building from physical values changes the bytes | the values cannot be written back | use Scaled with the correct scale and offset
 LS305 a field does not keep a written value | the value read differs from the value set | use the width and sign of the wire
 LS306 a frame is parsed as another type | its fields get another meaning | declare different constants, or frames in another order
@@ -110,17 +112,18 @@ LS507 decoding does not return the simulated scene | `sweep` and `points` contra
 LS508 `sweep` cannot be simulated | sim, demo and virtual_port fail
       | return the physical values of packet i, by field path
 LS509 the clock runs backwards when it wraps | durations become negative | declare Clock(..., wraps_at=) in seconds
-LS510 a wrap of the counter counts as loss | every wrap adds lost or late packets | declare PacketCounter(field, first=, last=)
+LS510 packets are reported as lost when the counter wraps | every wrap adds lost or late packets | declare PacketCounter(field, first=, last=)
 LS511 points turn in the wrong direction | left and right are exchanged, or vendor_axes differ from the manual
       | compare azimuth= and vendor_axes= with the manual's figure
 LS512 the clock exceeds wraps_at | it seems to wrap when it does not | declare Clock(..., wraps_at=) in seconds
 LS513 the times of points do not fit the clock | points of one packet get times of other scans | return time= in seconds
 LS514 a field cannot represent a value of `sweep` | the simulated sensor sends another value
       | return physical values in the unit of the field, within its limits
-LS601 parsing a built command returns other values | the sensor receives another command | use paths of its frame in values and args
+LS601 parsing a built command returns values that were not built | the sensor receives another command
+      | in values and args, use paths of the command's frame
 LS602 an argument is not limited to its range | the sensor receives invalid requests
       | declare args={name: (path, lowest, highest)}
-LS603 a reply cannot match | the command waits until its timeout | use fields of the reply in matches= and echoes=
+LS603 no reply can match the command | the command waits until its timeout | use fields of the reply in matches= and echoes=
 LS604 the simulated sensor does not send the documented reply | simulated commands time out | declare answers=, or other matches=
 LS605 a command or reply differs from its vector | the sensor expects or sends other bytes
       | compare values, args, matches and echoes

@@ -140,7 +140,7 @@ def serve(
     start_ns = get_now()
     device.utc_offset_ns = HostClock().now() - start_ns
     device.start(start_ns)
-    device.serve_at(outlet.data.port)
+    device.set_data_port(outlet.data.port)
     for link, data in early_commands:
         device.receive(data, start_ns, link)
     if seconds is None:

@@ -97,7 +97,7 @@ class SimulatedClock:
         writer = ClockWriter(sensor, sensor.clock, first)
         base = writer.read(first).item()
         timeline = ClockTimeline(self.faults, BEGAN_NS)
-        writer.write(table, timeline.shift(base + times, times, base))
+        writer.write(table, timeline.apply_faults(base + times, times, base))
         status = sensor.clock.status
         if status is not None and not status.frame:
             states = timeline.lock_states(times)

@@ -431,7 +431,7 @@ def test_a_clock_that_wraps_follows_if_its_period_is_a_share_of_a_day() -> None:
     # 1,785,283,205 s since 1970 are 29 July 2026, 00:00:05.
     position = next(vlp16.parse(item.data) for item in found if item.frame == "position")
     assert bytes(position.nmea).startswith(b"$GPRMC,000005,A,,,,,,,290726,")
-    with pytest.raises(UsageError, match="a day is not a multiple of this time"):
+    with pytest.raises(UsageError, match="a day is not a multiple of this time, so"):
         simulate(SHAPES["shape-columns"], 1, clock=parse_clock_faults("utc"))
 
 

@@ -1,10 +1,11 @@
-"""Prepare construct structs for the engine, and translate them to the frame tree.
+"""Prepare construct structs for lidarspec, and translate them to the frame tree.
 
-`prepare` returns a copy of a plugin's struct for the engine, `check_struct` raises an error if the
-struct is not supported, and `frame_tree` returns the tree of the struct. Modules in reading order:
+`prepare` returns a copy of a plugin's struct, in which lidarspec's own classes replace some classes
+of construct. `check_struct` raises an error if the struct is not supported, and `frame_tree`
+returns the tree of the struct. Modules in reading order:
 
 * `replacements`: classes that replace classes of construct, and additional classes.
-* `adapters`: converts adapters and texts to functions of raw values.
+* `adapters`: converts adapters and text fields to functions of raw values.
 * `raw_checksums`: replaces construct's Checksum of a RawCopy by a struct with a checksum.
 * `structs`: prepares a struct, finds properties of a construct, and draws random values.
 * `refusals`: raises errors for unsupported structs.

@@ -50,9 +50,9 @@ class Trial:
     Attributes:
         valid: the raw values that can be decoded.
         values: the decoded values.
-        failed: whether some raw values cannot be decoded.
-        lost: a raw value that changes when it is decoded and encoded, and the changed value; None
-            if no value changes.
+        failed: whether the adapter cannot decode some raw values.
+        lost: (raw value, changed value) for a raw value that changes when it is decoded and then
+            encoded; None if no value changes.
     """
 
     valid: tuple[Any, ...]
@@ -233,7 +233,11 @@ def _encode_text(con: Any, stripped: Any, value: Any, size: int) -> bytes:
 
 
 def make_part_adapter(con: Construct) -> tree.Adapter | None:
-    """Return the functions that decode and encode an independent part, or None."""
+    """Return the functions that decode and encode a part of a frame, or None.
+
+    None means that the part depends on other fields, is a struct, or changes when it is decoded and
+    then encoded.
+    """
     size = fixed_size(con)
     if not is_independent(con):
         return None

@@ -69,11 +69,17 @@ def frame_tree(con: Construct) -> tree.Node:
     Raises:
         SpecError: if the constant of an Enum field is a name that the Enum does not have.
     """
-    return _build_twice(lambda builder: builder.node(con, _Context(tree.FieldInfo(""), None)))[0]
+    return _build_in_passes(lambda builder: builder.node(con, _Context(tree.FieldInfo(""), None)))[
+        0
+    ]
 
 
-def _build_twice(build: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
-    """Call `build` once or twice, and return the node and the builder."""
+def _build_in_passes(build: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
+    """Call `build`, again if necessary, and return the node and the builder.
+
+    A struct with construct's Rebuild needs a second call, because the function of a Rebuild may
+    refer to later fields.
+    """
     builder = _Builder()
     root = build(builder)
     if builder.rebuilding:
@@ -153,7 +159,7 @@ class _Builder:
     """Makes the nodes of a struct.
 
     Args:
-        before: the builder of the first pass, if this is the second pass (`_build_twice`).
+        before: the builder of the first pass, if this is the second pass (`_build_in_passes`).
 
     Attributes:
         scopes: the scope of each struct after all its members were added, by path.
@@ -403,11 +409,14 @@ class _Builder:
             if not isinstance(expression, ExprMixin) and any(
                 ref.info.optional for ref in scope.asked
             ):
-                reason = "a Python function uses an optional field"
+                reason = (
+                    "a Python function uses an optional field: write an expression of `this`"
+                    " instead"
+                )
             elif isinstance(value, bool | int):
                 return int(value)
             elif not isinstance(value, tree.Symbol):
-                reason = f"the expression has the constant value {value!r}"
+                reason = f"the value of the expression is always {value!r}, which is no integer"
             elif not is_key and isinstance(value.formula, tree.Ref) and value.formula.info.labels:
                 reason = "an expression uses an Enum field as a number"
             elif fraction is not None and not may_be_fraction:
@@ -693,7 +702,7 @@ class _Builder:
             outside = tree.OuterScope(place.scope, builder._asked)
             return _Context(tree.FieldInfo(""), outside, offset=None)
 
-        root, builder = _build_twice(lambda builder: builder.node(case, around(builder)))
+        root, builder = _build_in_passes(lambda builder: builder.node(case, around(builder)))
         if following is None:
             rule = None
         else:
@@ -946,7 +955,12 @@ def _find_offset_after(
 
 
 def _is_single_value(ref: tree.Ref, info: tree.FieldInfo) -> bool:
-    """Return whether a field has one number for each element of a computed value."""
+    """Return whether a field has one number that each element of a computed value can use.
+
+    Args:
+        ref: a reference to the field.
+        info: the description of the computed value.
+    """
     return (
         not ref.path.startswith("_.")
         and ref.info.kind in ("int", "float")
@@ -1103,7 +1117,10 @@ def _make_number(info: tree.FieldInfo, size: int, *, is_big: bool) -> tree.Numbe
 
 
 def axis_path(info: tree.FieldInfo) -> str:
-    """Return the path of an array field; "[]" is appended for an array in an array."""
+    """Return the name of an array's axis: the path of the array field.
+
+    For an array in an array of the same field, "[]" is appended.
+    """
     path = info.path
     while path in info.axes:
         path += "[]"
