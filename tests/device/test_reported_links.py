@@ -268,7 +268,7 @@ def test_commands_over_the_data_link_are_broadcast_until_the_sensor_sends() -> N
         (lambda: Tcp(1, reported="port"), "Tcp requires a port"),
         (
             lambda: dataclasses.replace(SENSOR, links={**SENSOR.links, "data": Tcp(reported="a")}),
-            "only the data link may have `reported`",
+            "`reported` requires a command in `on_open` that provides the port",
         ),
         (
             lambda: dataclasses.replace(
