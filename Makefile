@@ -96,11 +96,11 @@ lint: $(TESTERS)
 types: $(DEVELOPERS)
 	@$(BIN)/mypy $(PACKAGES) benchmarks
 
-# With the pages of the sensors, the pictures of the front page, that of the page in the browser where Chromium is, and the notebook run.
+# With the pages of the sensors, the picture of the page in the browser where Chromium is, and the notebook run.
+# The other pictures are tracked: docs/pictures.py remakes them, and a test fails if they are out of date.
 # Without --quiet, which would let broken links pass.
 docs: $(WRITERS)
 	@$(BIN)/python docs/reference_pages.py
-	@$(BIN)/python docs/pictures.py
 	@PATH="$(abspath $(BIN)):$$PATH" NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir $(abspath $(SITE))
 	@$(BIN)/python docs/pictures.py --page --into $(SITE)/pictures
 
