@@ -126,7 +126,7 @@ class CEntry:
     depth: int = 0
     conditions: tuple[CCondition, ...] = ()
     loops: tuple[str, ...] = ()
-    part: tree.Part | None = None
+    part: tree.BlockInteger | None = None
 
     @property
     def full_condition(self) -> str:
@@ -245,7 +245,7 @@ class CLayout:
             arguments = format_arguments(len(ref.info.axes))
             return f"(int64_t){self.name(ref.path, '')}({arguments})"
 
-        return tree.write(value, format_field, _OPERATIONS)
+        return tree.format_formula(value, format_field, _OPERATIONS)
 
     def format_length(self, value: tree.Formula) -> str:
         """Return a number of elements or bytes as a C expression."""
@@ -422,7 +422,7 @@ def format_word(start: SizeFormula, size: int, order: str) -> str:
     return f"lidarspec_{'le' if order == 'little' else 'be'}(p + {start}, {size})"
 
 
-def _format_bits(part: tree.Part, start: SizeFormula) -> str:
+def _format_bits(part: tree.BlockInteger, start: SizeFormula) -> str:
     wide = "uint64_t" if part.bits.width > 32 else "uint32_t"
     terms = []
     for segment in part.bits.segments:
@@ -494,7 +494,7 @@ def _iter_size_functions(layout: CLayout) -> Iterator[str]:
                 )
 
 
-def _find_inner_axes(part: tree.Part) -> tuple[str, ...]:
+def _find_inner_axes(part: tree.BlockInteger) -> tuple[str, ...]:
     """Return the paths of the arrays around a part, inside its bit block."""
     return part.info.axes[len(part.info.axes) - len(part.indices) :]
 

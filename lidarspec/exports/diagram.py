@@ -185,7 +185,7 @@ class _ItemBuilder:
             for part in node.parts
             for run in part.bits.segments
         ]
-        runs: list[tuple[tree.Part, int, int, int]] = []
+        runs: list[tuple[tree.BlockInteger, int, int, int]] = []
         for byte, _, run, part in sorted(segments, key=lambda entry: (entry[0], -entry[1])):
             low = run.target
             high = run.target + run.mask.bit_count() - 1
@@ -199,7 +199,7 @@ class _ItemBuilder:
         ]
 
     def _make_run_cell(
-        self, node: tree.Block, part: tree.Part, low: int, high: int, start: SizeFormula
+        self, node: tree.Block, part: tree.BlockInteger, low: int, high: int, start: SizeFormula
     ) -> DiagramBox:
         """Return the box of the bits `low` to `high` of a value."""
         width = high - low + 1

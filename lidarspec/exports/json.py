@@ -310,7 +310,7 @@ def _info_data(info: tree.FieldInfo) -> dict[str, Any]:
     return {**facts, "labels": {str(value): name for value, name in info.labels.items()}}
 
 
-def _part_data(part: tree.Part) -> dict[str, Any]:
+def _part_data(part: tree.BlockInteger) -> dict[str, Any]:
     runs = [
         {"byte": run.byte, "low": run.low, "width": run.mask.bit_count(), "target": run.target}
         for run in part.bits.segments

@@ -118,7 +118,7 @@ _OPERATIONS = {
 
 def format_integer(formula: tree.Formula, scope: Scope) -> str:
     """Return a formula as an integer expression."""
-    return tree.write(formula, functools.partial(format_reference, scope), _OPERATIONS)
+    return tree.format_formula(formula, functools.partial(format_reference, scope), _OPERATIONS)
 
 
 def _format_of_last_part(formula: tree.Formula, scope: Scope) -> str:
@@ -134,7 +134,7 @@ def _format_of_last_part(formula: tree.Formula, scope: Scope) -> str:
             return format_reference(scope, tree.Ref(ref.path[2:], ref.info))
         return ".".join(["_", *map(identifier, ref.path.split("."))])
 
-    return tree.write(formula, format_field, _OPERATIONS)
+    return tree.format_formula(formula, format_field, _OPERATIONS)
 
 
 def to_condition(formula: tree.Formula, scope: Scope) -> str:
@@ -233,11 +233,13 @@ def as_block(node: tree.Node) -> tree.Node:
         8 * (byte if node.order == "little" else node.size - 1 - byte) for byte in range(node.size)
     ]
     segments = tuple(Segment(byte, 0xFF, 0, target) for byte, target in enumerate(targets))
-    part = tree.Part(node.info, BitField((), segments, 8 * node.size, node.kind == "int"), (), ())
+    part = tree.BlockInteger(
+        node.info, BitField((), segments, 8 * node.size, node.kind == "int"), (), ()
+    )
     return tree.Block(node.name, node.info, node.size, (part,))
 
 
-def _make_part_name(part: tree.Part) -> str:
+def _make_part_name(part: tree.BlockInteger) -> str:
     """Return the name of a part of a bit block in the block's Kaitai type."""
     return identifier("_".join([*(part.names or ("value",)), *map(str, part.indices)]))
 
@@ -249,7 +251,7 @@ def _list_allowed_values(info: tree.FieldInfo) -> Attribute:
     return {}
 
 
-def _make_valid(part: tree.Part) -> Attribute:
+def _make_valid(part: tree.BlockInteger) -> Attribute:
     if part.info.const is None:
         if part.bits.width > 1:
             return _list_allowed_values(part.info)
@@ -264,7 +266,7 @@ def _copy_condition(more: Mapping[str, Any]) -> Attribute:
     return {}
 
 
-def _find_bit_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
+def _find_bit_order(block: tree.Block) -> tuple[list[tree.BlockInteger], str] | None:
     """Return the parts of a block as Kaitai reads them, and the order "be" or "le".
 
     Returns None if Kaitai cannot read the block in either order.
@@ -295,7 +297,7 @@ def _find_starts(bits: BitField, suffix: str) -> set[int]:
     }
 
 
-def _assemble_part(part: tree.Part, raw: str) -> str:
+def _assemble_part(part: tree.BlockInteger, raw: str) -> str:
     """Return the Kaitai expression that calculates a part from its block's bytes."""
     terms = []
     for segment in part.bits.segments:

@@ -83,7 +83,7 @@ def _format_function(value: tree.Formula, missing: str = "") -> LuaCode:
     """
     return LuaCode(
         "function(v) return"
-        f" {tree.write(value, lambda ref: f'(v[{quote_lua(ref.path)}]{missing})', _OPERATIONS)} end"
+        f" {tree.format_formula(value, lambda ref: f'(v[{quote_lua(ref.path)}]{missing})', _OPERATIONS)} end"
     )
 
 
@@ -268,7 +268,9 @@ class _TableWriter:
             "parts": parts,
         }
 
-    def _make_part_table(self, block: tree.Block, part: tree.Part, order: str | None) -> Table:
+    def _make_part_table(
+        self, block: tree.Block, part: tree.BlockInteger, order: str | None
+    ) -> Table:
         offsets = [segment.byte for segment in part.bits.segments]
         is_masked = order is not None and part.bits.width < 8 * block.size
         if order is not None and is_masked:
@@ -503,7 +505,7 @@ def _make_algorithm_table(algorithm: Checksum) -> Table:
     )
 
 
-def _list_numbers(node: tree.Node) -> list[tree.Node | tree.Part]:
+def _list_numbers(node: tree.Node) -> list[tree.Node | tree.BlockInteger]:
     """Return the numbers in a node, or [] if the node has arrays or conditional parts."""
     below = list(tree.nodes(node))
     if any(isinstance(part, tree.Repeat | tree.When | tree.Select) for part in below):

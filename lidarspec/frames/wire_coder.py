@@ -24,7 +24,7 @@ from lidarspec.frames.measured_size import MeasuredSize
 from lidarspec.spec.description import Frame
 from lidarspec.spec.wire_forms import (
     Decoded,
-    DrawsValues,
+    LimitsValues,
     NumberRun,
     Problem,
     Run,
@@ -237,7 +237,7 @@ class FormCoder(Coder):
                     largest = np.array([self.form.largest(size) for size in sizes], np.uint64)
                 for row in part:
                     values = _wrap_values(run.from_bytes(row.tobytes()), largest)
-                    if isinstance(self.form, DrawsValues):
+                    if isinstance(self.form, LimitsValues):
                         values = self.form.to_encodable(run, values)
                     row[:] = np.frombuffer(run.to_bytes(values), np.uint8)
             elif self.form.is_text:

@@ -246,13 +246,13 @@ def _make_row(
     return WireRow(offset, size, kind, shown, format_unit(info), says)
 
 
-def _make_part_path(shown: str, part: tree.Part) -> str:
+def _make_part_path(shown: str, part: tree.BlockInteger) -> str:
     return ".".join(filter(None, (shown, *part.names))) + "".join(
         f"[{index}]" for index in part.indices
     )
 
 
-def _describe_bits(part: tree.Part) -> tuple[str, str]:
+def _describe_bits(part: tree.BlockInteger) -> tuple[str, str]:
     """Return the size and the type of a part of a bit block, as texts."""
     if part.info.dtype is None and part.bits.run is not None and part.bits.is_whole:
         order, _, size, _ = part.bits.run
@@ -325,7 +325,7 @@ def format_formula(formula: tree.Formula) -> str:
     if isinstance(formula, tree.Untraced):
         text = formula.text
     else:
-        text = tree.write(formula, lambda ref: ref.path, {})
+        text = tree.format_formula(formula, lambda ref: ref.path, {})
     if _is_enclosed(text):
         return text[1:-1]
     return text

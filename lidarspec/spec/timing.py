@@ -57,10 +57,11 @@ class OnWrap:
 
 @dataclass(frozen=True)
 class OnFlag:
-    """End a scan before every packet, or element of an array, with a set flag.
+    """End a scan before every packet in which a flag is set.
 
     Args:
-        name: the path of the flag's field.
+        name: the path of the flag's field. If the field is in an array, scans end before every
+            element of the array in which the flag is set.
         value: the value of a set flag; by default every value except 0.
     """
 
@@ -70,13 +71,15 @@ class OnFlag:
 
 @dataclass(frozen=True)
 class OnChange:
-    """End a scan before every packet, or element of an array, with a changed value.
+    """End a scan before every packet in which the value of a field has changed.
 
     Args:
-        name: a field path.
+        name: the path of the field. If the field is in an array, scans end before every element of
+            the array with a changed value.
         angle: the path of the field with the angle at which a packet begins; "" if the frame has no
-            such field. The angle has to increase evenly as the sensor rotates. It is used to find a
-            masked sector, and by `configure(cut=)`.
+            such field. The angle has to increase evenly as the sensor rotates. The angle is used to
+            recognize a sector in which the sensor sends nothing, and to move the start of a scan
+            with `configure(cut=)`.
         full: the increase of the angle in one revolution, in the unit of the field.
     """
 
@@ -87,11 +90,12 @@ class OnChange:
 
 @dataclass(frozen=True)
 class OnJump:
-    """End a scan before every packet, or element of an array, with a large step.
+    """End a scan before every packet in which a field makes a large step.
 
     Args:
-        name: a field path. Steps of an angle are measured in the shorter direction around the
-            circle.
+        name: the path of the field. If the field is in an array, scans end before every element of
+            the array with a large step. Steps of an angle are measured in the shorter direction
+            around the circle.
         by: the smallest step, in either direction, that ends a scan, in the unit of the field.
     """
 
@@ -231,16 +235,28 @@ class Clock:
             )
 
     def epoch_in(self, state: ClockState | None) -> str:
-        """Return the epoch of the clock in a state, which is None if it is unknown."""
+        """Return the epoch from which the clock counts in a state, a key of `EPOCHS`.
+
+        Args:
+            state: the state of the clock; None if the state is unknown.
+        """
         if state is not None and state.epoch is not None:
             return state.epoch
         return self.epoch
 
     def epoch_at(self, time_ns: int, state: ClockState | None) -> str:
-        """Return the epoch of the clock at a time in ns, in a state."""
+        """Return the epoch of a time that was read from the clock, a key of `EPOCHS`.
+
+        The result is that of `epoch_in`, with one exception: for a clock that counts from the full
+        hour, the result is "utc" if the date of another frame was added to the time.
+
+        Args:
+            time_ns: the time of the clock, in ns.
+            state: the state of the clock; None if the state is unknown.
+        """
         epoch = self.epoch_in(state)
         if epoch == "hour" and time_ns >= FIRST_DATE_NS:
-            return "utc"  # another frame has completed the hour
+            return "utc"
         return epoch
 
 
@@ -285,10 +301,11 @@ def unix_time(
         year: with its century, for example 2026.
         month: 1 to 12.
         day: 1 to 31.
-        hour, minute, second: the time of day. A larger value, such as 86400 seconds, is allowed.
+        hour, minute, second: the time of day. A value beyond its usual range, such as a second of
+            86400, is allowed.
 
     Returns:
-        float64, the broadcast shape; whole seconds are exact.
+        float64 values of the shape to which the arguments broadcast. Whole seconds are exact.
     """
     # years begin in March, so that the leap day is the last day of a year
     is_before_march = month <= 2

@@ -8,7 +8,7 @@ are stored, and its `FieldInfo` describes their value.
     Sealed          a Struct with a checksum
     Number          an integer or float of whole bytes
     Blob            plain bytes; the name of an unnamed constant is ""
-    Block           bytes that contain one or more integers as bits (`Part`)
+    Block           bytes that contain one or more integers as bits (`BlockInteger`)
     Repeat          an array: one element, repeated
     PartSequence    frames within the frame, one after another, each with its own size
     When            one of two nodes, by a condition
@@ -60,7 +60,8 @@ class Adapter:
         encode: a function of a value and the size of the field in bytes.
         dtype: the dtype of a column; uint8 if columns have the raw bytes.
         allowed: the raw values that can be decoded; None if there is no list.
-        is_partial: whether a frame can be invalid because a raw value cannot be decoded.
+        is_partial: whether there are raw values that cannot be decoded. A frame with such a value
+            is invalid.
         form: a text that describes how the value is stored; "" for a plain number.
         decode_bytes: a function that decodes an array of bytes along the last axis, or None.
     """
@@ -75,7 +76,7 @@ class Adapter:
 
     @property
     def has_columns(self) -> bool:
-        """Whether columns have the decoded values."""
+        """Whether columns contain the decoded values, instead of the raw values."""
         return self.dtype != np.uint8 or self.decode_bytes is not None
 
     def decode_column(self, raw: NDArray[Any], *, is_bytes: bool) -> NDArray[Any]:
@@ -128,8 +129,8 @@ class FieldInfo:
 
     Attributes:
         path: the path without indices, such as "points.distance".
-        axes: the axes of the arrays that contain the field, outermost first. A field of bytes is
-            itself an array of bytes, so its path is the last axis.
+        axes: the paths of the arrays that contain the field, outermost first. A field of bytes
+            counts as an array of bytes, so the last entry is its own path.
         dtype: the dtype of the raw value in native byte order; None if only construct can read it.
         kind: "int", "float", "bytes" or "other".
         scale, offset, unit: ``physical = raw * scale + offset``, in this unit.
@@ -143,7 +144,8 @@ class FieldInfo:
         is_enforced: whether a parsed frame must have the value of `rebuilt` (`SizeOf`).
         labels: the names of raw values (construct's Enum).
         optional: whether some frames do not have the field.
-        measured: whether the plugin declares a unit, or declares that the value is a plain number.
+        measured: whether the plugin declares the unit with `Scaled`. The declared unit may be "",
+            for a plain number; all fields without `Scaled` have the unit "" too.
         adapter: the functions that decode raw values; None if raw values are not decoded.
     """
 
@@ -339,8 +341,11 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
 }
 
 
-def calculate(symbol: str, *args: Formula) -> Formula:
-    """Return an operation as a formula."""
+def make_operation(symbol: str, *args: Formula) -> Formula:
+    """Return the formula of an operation; an integer if all operands are integers.
+
+    Only additions, subtractions and multiplications of integers are calculated.
+    """
     if all(isinstance(arg, int) for arg in args) and symbol in ("+", "-", "*"):
         return int(_OPERATIONS[symbol](*args))
     return Op(symbol, args)
@@ -405,11 +410,13 @@ def _is_condition(formula: Formula) -> bool:
     )
 
 
-def write(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str, str]) -> str:
+def format_formula(
+    formula: Formula, format_ref: Callable[[Ref], str], operations: Mapping[str, str]
+) -> str:
     """Return a formula as an expression of another language.
 
     Args:
-        named: a function that returns the text of a field.
+        format_ref: a function that returns the text of a field.
         operations: the texts of operations that differ from Python, such as "({} / {})" for "//".
 
     Raises:
@@ -417,14 +424,14 @@ def write(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str
     """
     match formula:
         case Ref():
-            return named(formula)
+            return format_ref(formula)
         case Op("-", (operand,)):
-            return f"(-{write(operand, named, operations)})"
+            return f"(-{format_formula(operand, format_ref, operations)})"
         case Op(symbol, args):
             text = operations.get(
                 symbol, "(not {})" if symbol == "not" else f"({{}} {symbol} {{}})"
             )
-            return text.format(*(write(arg, named, operations) for arg in args))
+            return text.format(*(format_formula(arg, format_ref, operations) for arg in args))
         case Untraced():
             raise ValueError(formula.reason)
     if formula < 0:
@@ -433,12 +440,14 @@ def write(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str
 
 
 def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
-    """Return a field in one element of arrays, or None if an array lacks the field.
+    """Return the `FieldInfo` of a field for one element of its arrays.
+
+    Returns None if `indices` has an array that does not contain the field.
 
     Args:
         info: the field in all elements.
-        path: the path with the indices.
-        indices: the index of the element in each array, by the axis of the array.
+        path: the path of the field with the indices.
+        indices: the path of an array -> the index of the element in this array.
     """
     if not indices.keys() <= set(info.axes):
         return None
@@ -560,7 +569,8 @@ class Ending:
     """The end of bytes of variable size: a mark, or the end of the datagram.
 
     Attributes:
-        size: the field that formulas use for the number of bytes before the end.
+        size: a field that has no bytes in the frame. Formulas use it for the number of bytes before
+            the end.
         mark: the bytes of the mark, such as a terminator; b"" if the bytes end with the datagram.
         mask: the bits of each byte that are compared with the mark.
         is_content: whether the mark belongs to the content, as in a number of variable size.
@@ -597,7 +607,7 @@ class Blob:
     Attributes:
         size: the number of bytes, without the terminator.
         const: the bytes; None if any bytes are allowed.
-        ending: the mark that ends the bytes; None if there is no mark.
+        ending: the end of bytes of variable size; None if `size` alone determines their number.
     """
 
     name: str
@@ -608,7 +618,7 @@ class Blob:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class BlockInteger:
     """One integer of a block.
 
     Attributes:
@@ -636,7 +646,7 @@ class Block:
     name: str
     info: FieldInfo
     size: int
-    parts: tuple[Part, ...]
+    parts: tuple[BlockInteger, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -663,12 +673,12 @@ class Sealed:
     """A struct with a checksum.
 
     Attributes:
-        body: the struct, or a `Sealed` with another checksum.
+        body: the struct, or a `Sealed` of the struct with another checksum.
         fields: the paths of the fields with the checksum, low bits first.
         over: the paths of the first and the last member that the checksum covers; None for all
             bytes of the body without the bytes of `fields`.
-        declared: the algorithm; None if a hook has to return it.
-        absent: the values of a frame without a checksum.
+        declared: the declared algorithm; None if a hook has to return the algorithm.
+        absent: the values of the checksum that mean that the sensor has computed no checksum.
     """
 
     body: Struct | Sealed
@@ -749,8 +759,10 @@ class PartSequence:
         size: the size of the first part in bytes; None if it is not declared.
         within: the total size of all parts in bytes; None if it is not declared.
         outer: the fields of the outer frame that formulas of the parts use.
-        total: the field that later formulas use for the total size of all parts.
-        is_array: whether the parts are elements of an array, with different sizes.
+        total: a field that has no bytes in the frame. Later formulas use it for the total size of
+            all parts.
+        is_array: whether the plugin declares an array whose elements differ in size; False if the
+            plugin declares `Parts`.
     """
 
     name: str
@@ -855,7 +867,8 @@ class Opaque:
     Attributes:
         kind: the name of its construct class.
         reason: why the part cannot be converted to another node.
-        inside: the nodes inside a bit block or a struct, without offsets.
+        inside: the nodes inside the part; () if the part has no members. Their offsets in the frame
+            are not known.
         size: the size in bytes; None if it depends on the content.
         form: how the value is stored, as text to display.
         in_bits: whether the part is a bit block.
@@ -951,24 +964,24 @@ def size(node: Node) -> Formula | None:
         case When():
             return _sum_alternatives(
                 [
-                    (calculate("!=", node.condition, 0), size(node.then)),
-                    (calculate("==", node.condition, 0), size(node.otherwise)),
+                    (make_operation("!=", node.condition, 0), size(node.then)),
+                    (make_operation("==", node.condition, 0), size(node.otherwise)),
                 ]
             )
         case Select():
             cases = [
-                (calculate("==", node.key, value), size(case))
+                (make_operation("==", node.key, value), size(case))
                 for value, case in node.cases
                 if not isinstance(case, Never)
             ]
-            others = [calculate("!=", node.key, value) for value, _ in node.cases]
+            others = [make_operation("!=", node.key, value) for value, _ in node.cases]
             if isinstance(node.default, Never):
                 return _sum_alternatives(cases)
             return _sum_alternatives(
                 [
                     *cases,
                     (
-                        functools.reduce(functools.partial(calculate, "*"), others),
+                        functools.reduce(functools.partial(make_operation, "*"), others),
                         size(node.default),
                     ),
                 ]
@@ -1001,7 +1014,7 @@ def combine(symbol: str, one: Formula | None, other: Formula | None) -> Formula 
         case "+" | "-", Op("+" | "-" as inner, (first, int() as known)), int():
             number = (known if inner == "+" else -known) + (other if symbol == "+" else -other)
             return combine("+" if number >= 0 else "-", first, abs(number))
-    return calculate(symbol, one, other)
+    return make_operation(symbol, one, other)
 
 
 def _sum_alternatives(cases: Sequence[tuple[Formula, Formula | None]]) -> Formula | None:
@@ -1207,7 +1220,7 @@ def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
     if wrong is not None:
         raise UntraceableExpressionError(f"an expression uses {wrong!r}, which is not a number")
     return Symbol(
-        calculate(symbol, *(int(part) if isinstance(part, bool) else part for part in pair))
+        make_operation(symbol, *(int(part) if isinstance(part, bool) else part for part in pair))
     )
 
 

@@ -189,7 +189,8 @@ def wrap(a: Array, full: float) -> Array:
 def following(a: Array, step: int = 1) -> Array:
     """Return for each value the value `step` places later in the stream.
 
-    The later value may be in another packet. Padding is not counted.
+    The later value may be in another packet. Places that only fill up a packet with fewer values
+    than the longest packet are skipped.
 
     Returns:
         float64, the shape of `a`; nan if packets or bytes were lost between the two values, and at
@@ -201,7 +202,8 @@ def following(a: Array, step: int = 1) -> Array:
 def previous(a: Array, step: int = 1) -> Array:
     """Return for each value the value `step` places earlier in the stream.
 
-    The earlier value may be in another packet. Padding is not counted.
+    The earlier value may be in another packet. Places that only fill up a packet with fewer values
+    than the longest packet are skipped.
 
     Returns:
         float64, the shape of `a`; nan if packets or bytes were lost between the two values, and at
@@ -238,15 +240,15 @@ def between_blocks(
 ) -> Array:
     """Return the angle that a rotor turns from each block to the next.
 
-    A step that is larger than `fastest` results from lost packets or a masked sector. It is
-    invalid, and replaced by the last valid step in the stream.
+    A step of at least 1.25 times `fastest` results from lost packets or a masked sector. Such a
+    step is invalid and is replaced by the previous valid step in the stream.
 
     Args:
         azimuth: the azimuth of each block, in the unit of `full`.
         ahead: the azimuth of the next block, for example ``following(azimuth)``. If consecutive
             blocks can have the same azimuth, pass the next different azimuth.
         fastest: the angle from block to block at the highest speed of the sensor, in the unit of
-            `full`. Steps may be up to 25 % larger, because encoder readings vary.
+            `full`. Valid steps may be up to 25 % larger, because encoder readings vary.
         repeat: False to replace invalid steps by nan.
         full: a whole turn in the unit of `azimuth`.
 
@@ -265,18 +267,19 @@ def between_blocks(
 def stack(*columns: Array) -> Array:
     """Return columns side by side on a new innermost axis.
 
-    k columns of shape (n, b) become one column of shape (n, b, k).
+    k columns of shape (n, b) become one column of shape (n, b, k). Columns of different shapes are
+    broadcast first.
     """
-    return _apply(side_by_side, *columns)
+    return _apply(stack_arrays, *columns)
 
 
-def side_by_side(*arrays: Any) -> Any:
-    """Return arrays side by side on a new innermost axis, after broadcasting them."""
+def stack_arrays(*arrays: Any) -> Any:
+    """Do for arrays what `stack` does for columns."""
     return np.stack(np.broadcast_arrays(*arrays), axis=-1)
 
 
 def running(a: Array) -> Array:
-    """Return the cumulative sum along the innermost array.
+    """Return the running (cumulative) sum of values along the innermost array.
 
     Returns:
         float64, the shape of `a`.

@@ -117,7 +117,10 @@ class NumberRun:
 
     @cached_property
     def lowest(self) -> Values:
-        """The magnitude of the lowest value of each number, (n,); 0 without a sign."""
+        """The absolute value of the lowest value of each number, (n,).
+
+        It is 0 for unsigned numbers and floats.
+        """
         lowest = (self.largest >> np.uint64(1)) + np.uint64(1)
         return np.where(self.kinds == "i", lowest, np.uint64(0))
 
@@ -132,7 +135,11 @@ class NumberRun:
         return 8 * self.owners + 7 - significance
 
     def to_bytes(self, values: Values) -> bytes:
-        """Return the first numbers of the run as bytes of the struct."""
+        """Return values of numbers as bytes of the struct.
+
+        Args:
+            values: the values of the first numbers of the run, or of all numbers.
+        """
         size = self.ends.item(len(values) - 1) if len(values) else 0
         words = values.astype(">u8").view(np.uint8)
         return words[self._word_offsets[:size]].tobytes()
@@ -189,7 +196,10 @@ class Decoded:
 
     @property
     def offsets(self) -> list[int]:
-        """The offset in the frame of the field of each byte; the last element is `end`."""
+        """The offset in the encoded frame at which the field of each struct byte begins.
+
+        The last element is `end`.
+        """
         starts = [begins.repeat(sizes) for begins, sizes in self.spans]
         return [*np.concatenate([np.zeros(0, np.intp), *starts]).tolist(), self.end]
 
@@ -214,12 +224,14 @@ class WireForm(Protocol):
     is_text: ClassVar[bool] = False
 
     def begins(self, texts: Sequence[Characters]) -> Characters:
-        """Return the first bytes of every encoded frame; None for a byte that varies.
+        """Return the bytes with which every encoded frame begins.
 
-        The result ends before the first byte without a fixed offset. By default, it is empty.
+        An element is None if its byte varies. The result ends before the first byte without a fixed
+        offset. By default, the result is empty.
 
         Args:
-            texts: the bytes of the first fields of the struct; None for each byte that varies.
+            texts: the bytes of each of the bytes fields with which the struct begins. An element is
+                None if its byte varies.
         """
         return ()
 
@@ -277,8 +289,8 @@ class BulkEnds(Protocol):
     def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
         """Return the size of the frame at each offset, or `NO_END` or `NO_FRAME`, (n,).
 
-        The size of a valid frame is the same as that of `find_end`. An invalid frame may give
-        `NO_FRAME`.
+        For a valid frame, the result is the same as that of `find_end`. For an invalid frame, the
+        result is either the same as that of `find_end`, or `NO_FRAME`.
 
         Args:
             buffer: the input.
@@ -288,15 +300,18 @@ class BulkEnds(Protocol):
 
 
 @runtime_checkable
-class DrawsValues(Protocol):
-    """A wire form that cannot encode every value up to `largest`."""
+class LimitsValues(Protocol):
+    """A wire form that cannot encode every value up to `largest`.
+
+    Random values are converted to values that can be encoded.
+    """
 
     def to_encodable(self, run: NumberRun, values: Values) -> Values:
-        """Return random values that can be encoded, (n,).
+        """Return values that can be encoded, (n,).
 
         Args:
             run: the numbers.
-            values: random bits from which the values are made, (n,).
+            values: random bits from which the returned values are made, (n,).
         """
 
 
@@ -319,8 +334,9 @@ def decode_runs(reader: RunReader, next_runs: NextRuns, size: int | None) -> Dec
     """Read the fields of a frame.
 
     Args:
-        size: the size of the frame, in which the end mark counts as one byte; None without an end
-            mark.
+        size: the `position` of the reader after the last field of a complete frame: 1 plus the
+            offset in the frame at which the fields end. None if the end of the frame has not
+            arrived.
     """
     struct = b""
     spans = list[tuple[Offsets, Offsets]]()
@@ -353,7 +369,10 @@ def find_next_offsets(places: Offsets, offsets: Offsets, none: int) -> Offsets:
 
 @lru_cache(maxsize=64)
 def _make_digit_values(base: int) -> tuple[Values, NDArray[np.bool_]]:
-    """Return the value of each character as a digit, and a mask of digits, 256 each."""
+    """Return the value of each character as a digit, and whether it is a digit.
+
+    Both arrays have the shape (256,), and their index is the character.
+    """
     values = np.zeros(256, np.uint64)
     is_digit = np.zeros(256, np.bool_)
     for value, character in enumerate("0123456789ABCDEF"[:base]):
@@ -632,7 +651,10 @@ class _TokenReader:
                 self._convert_signed(characters[self._begins])
 
     def _convert_numbers(self, characters: NDArray[np.uint8]) -> None:
-        """Convert all tokens that consist of digits without a sign."""
+        """Store the number of each token that contains only digits in `_magnitudes`.
+
+        `_is_number` is set to False for all other tokens.
+        """
         values, is_digit = _make_digit_values(self._form.base)
         lengths = self._marks - self._begins
         body = characters[1 : self._marks[-1] + 1]
@@ -644,7 +666,7 @@ class _TokenReader:
         self._is_number = ~has_wrong & (lengths > 0) & (lengths <= MAX_DIGITS)
 
     def _convert_signed(self, first_characters: NDArray[np.uint8]) -> None:
-        """Convert the tokens that begin with a sign to decimal numbers."""
+        """Store the number of each token that is a sign and decimal digits."""
         self._signs = first_characters
         has_sign = (first_characters == PLUS) | (first_characters == MINUS)
         for index in np.flatnonzero(has_sign).tolist():
@@ -736,10 +758,11 @@ class _TokenReader:
 
 @dataclass(frozen=True)
 class Echoes:
-    """The encoding of steps with a variable number of echoes, joined by a mark.
+    """How the echoes of each step are sent: up to `most` echoes with a mark between them.
 
-    In the struct, each step has `most` echoes, and a missing echo is 0. When a step is encoded,
-    echoes of 0 at its end are left out, except for the first echo.
+    A step is one direction of a scan. In the struct, each step has `most` echoes, and a missing
+    echo is 0. When a step is encoded, echoes of 0 at its end are left out, except for the first
+    echo.
 
     Args:
         size: the number of characters of an echo.
@@ -838,9 +861,10 @@ class Echoes:
 class SixBits:
     """Numbers in characters of six bits each, the highest bits first.
 
-    It is used as ``Lines(...) | SixBits()``. A field of n bytes is sent as n characters: an
-    `Int16ub` as two, an `Int24ub` as three, and an `Int32ub` as four characters. An `Int8ub` is
-    sent as one character, which may also be a decimal digit.
+    It is used as ``Lines(...) | SixBits()``. A number of n bytes is sent as n characters, so only
+    its lowest 6 * n bits are sent: an `Int16ub` as two, an `Int24ub` as three, and an `Int32ub` as
+    four characters. The value of a character is its code minus the code of `first`. With the
+    default, an `Int8ub` for a character "0" to "9" therefore has the value of this decimal digit.
 
     Args:
         first: the character for 0.
@@ -938,9 +962,10 @@ class _SixBitReader:
 
 @dataclass(frozen=True)
 class Scip:
-    """The check character of SCIP: six bits of the sum of a line's characters.
+    """The check character of SCIP: the lowest six bits of the sum of a line's characters.
 
-    The character "0" stands for 0.
+    The bits are sent as one character: "0" for 0, and the following characters of ASCII for larger
+    numbers.
 
     Source: SCIP 2.0, C-42-03320B, 5.
     """

@@ -717,7 +717,7 @@ def test_bytes_that_cannot_be_decompressed_are_no_frame() -> None:
     data = ours.build("data", k=1, a=b"abc")
     assert ours.build("data", ours.parse(data)) == data
     with pytest.raises(
-        WireError, match="a at byte 2: value other bytes, expected bytes compressed"
+        WireError, match="a at byte 2: value bytes that cannot be decompressed, expected bytes"
     ):
         ours.parse(b"\1\2ab")
     assert ours.decode([b"\1\2ab", data]).stats.implausible == 1

@@ -43,7 +43,7 @@ from lidarspec.points.numba_kernels.writer import (
     is_cheap,
 )
 from lidarspec.points.plan import Plan
-from lidarspec.spec.vocabulary import TableLookup, side_by_side
+from lidarspec.spec.vocabulary import TableLookup, stack_arrays
 
 #: The number of points in scratch arrays, so that the arrays fit in the fastest cache.
 SCRATCH_POINTS = 2048
@@ -197,7 +197,7 @@ class Expressions(KernelWriter):
             if not isinstance(arg, Node)
         ):
             return self.add_argument(node)
-        if node.function is side_by_side and len(node.shape) == depth + 1:
+        if node.function is stack_arrays and len(node.shape) == depth + 1:
             parts = [self.write_double(arg, depth) for arg in node.args]
             chain = "".join(
                 f"{part.text} if i{depth} == {at} else " for at, part in enumerate(parts[:-1])

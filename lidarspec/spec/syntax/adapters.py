@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from lidarspec.spec import tree
 from lidarspec.spec.syntax.structs import (
-    author_class,
     bit_width,
+    declared_class_name,
     find_xor_key,
     fixed_size,
     is_independent,
@@ -214,7 +214,7 @@ def make_number_adapter(con: Construct) -> tree.Adapter:
     def encode(value: Any, _: int) -> bytes:
         return bytes(con.build(check(value)))
 
-    form = f"{author_class(con)} in its shortest form"
+    form = f"{declared_class_name(con)} in its shortest form"
     return tree.Adapter(decode, encode, dtype, is_partial=True, form=form)
 
 

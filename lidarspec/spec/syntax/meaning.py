@@ -55,7 +55,7 @@ from lidarspec.spec.syntax.replacements import (
     SizeField,
 )
 from lidarspec.spec.syntax.structs import (
-    author_class,
+    declared_class_name,
     fixed_size,
     is_greedy,
     iter_leaves,
@@ -534,7 +534,7 @@ class _Builder:
             return tree.combine("-", number, size)
         if size is None:
             return size
-        return tree.calculate("%", tree.calculate("-", size), number)
+        return tree.make_operation("%", tree.make_operation("-", size), number)
 
     def _measure_part(self, con: SizeField, place: _Context) -> tree.Formula | None:
         """Return the formula for the size of a part; None in the first pass."""
@@ -571,7 +571,7 @@ class _Builder:
             ),
         )
         size = tree.size(element)
-        kind = author_class(con)
+        kind = declared_class_name(con)
         if isinstance(con, construct.RepeatUntil) or not isinstance(size, int):
             until = getattr(con, "predicate", None)
             within = place.bytes_left if until is None else None
@@ -586,7 +586,9 @@ class _Builder:
                 " use Parts(element, within=...)"
             )
             return tree.Opaque(place.name, place.info, kind, reason, (element,))
-        return tree.Repeat(place.name, axis, tree.calculate("//", place.bytes_left, size), element)
+        return tree.Repeat(
+            place.name, axis, tree.make_operation("//", place.bytes_left, size), element
+        )
 
     def _make_parts(self, con: Partition, place: _Context) -> tree.PartSequence:
         info = place.info
@@ -795,7 +797,7 @@ class _Builder:
             if name and place.scope is not None:
                 place.scope.names[name] = _to_scope_value(blob.info)
         else:
-            kind = author_class(con)
+            kind = declared_class_name(con)
             if isinstance(con, construct.FixedSized):
                 size = self._to_formula(con.length, place)
             else:
@@ -879,7 +881,7 @@ class _Builder:
             names = tuple(key for key in bits.keys if isinstance(key, str))
             info = infos[".".join(part for part in (place.info.path, *names) if part)]
             parts.append(
-                tree.Part(
+                tree.BlockInteger(
                     info, bits, names, tuple(key for key in bits.keys if isinstance(key, int))
                 )
             )
@@ -1181,10 +1183,10 @@ def _is_text(con: Construct) -> bool:
 def _find_opaque_reason(con: Construct) -> str:
     """Return the reason why only construct can read a part."""
     below = con
-    while author_class(below) not in _OPAQUE_REASONS and isinstance(below, Subconstruct):
+    while declared_class_name(below) not in _OPAQUE_REASONS and isinstance(below, Subconstruct):
         below = below.subcon
-    kind = author_class(below)
-    return _OPAQUE_REASONS.get(kind, f"{author_class(con)} has no fixed offset")
+    kind = declared_class_name(below)
+    return _OPAQUE_REASONS.get(kind, f"{declared_class_name(con)} has no fixed offset")
 
 
 def _describe_form(con: Construct) -> str:

@@ -4,6 +4,9 @@ A struct with ``"body" / RawCopy(...), "crc" / Checksum(Int8ub, function, this.b
 converted to a `Checksummed` with the function as its algorithm. To find the covered part, the
 expression of the Checksum is called with an object that records the names that the expression
 reads.
+
+The arguments with which a `SealedStruct` (the class of `Checksummed`) is made for one checksum are
+called a seal.
 """
 
 from __future__ import annotations
@@ -28,17 +31,17 @@ class FunctionChecksum(Checksum):
 
     Attributes:
         function: the function, which returns the checksum as a number or bytes.
-        takes_part: whether the argument of the function is the whole value of a RawCopy, instead of
-            only its bytes.
+        takes_raw_copy: whether the function is called with the Container that a RawCopy returns,
+            instead of only the bytes of the part.
     """
 
     function: Callable[[Any], int | bytes]
     width: int
-    takes_part: bool = False
+    takes_raw_copy: bool = False
 
     def __call__(self, data: bytes | bytearray | memoryview) -> int:
         content: Any = bytes(data)
-        if self.takes_part:
+        if self.takes_raw_copy:
             content = construct.Container(data=content, length=len(content))
         value = self.function(content)
         if isinstance(value, bytes):
@@ -65,11 +68,14 @@ class _NameRecorder:
 
 
 def extract_seals(members: Sequence[Construct]) -> tuple[list[Construct], list[dict[str, Any]]]:
-    """Replace each Checksum of a RawCopy in a struct by the field that stores it.
+    """Replace each Checksum of a RawCopy by a plain field that stores the checksum.
+
+    Args:
+        members: the members of a struct.
 
     Returns:
-        The new members of the struct, and the arguments of a `SealedStruct` for each replaced
-        checksum.
+        The new members of the struct, and the seal of each replaced Checksum: the arguments of a
+        `SealedStruct`.
     """
     found = list[Construct]()
     seals = list[dict[str, Any]]()
@@ -79,9 +85,9 @@ def extract_seals(members: Sequence[Construct]) -> tuple[list[Construct], list[d
         if over is None or not isinstance(checksum, construct.Checksum):
             found.append(member)
             continue
-        names, takes_part = over
+        names, takes_raw_copy = over
         width = 8 * int(checksum.checksumfield.sizeof())
-        algorithm = FunctionChecksum(checksum.hashfunc, width, takes_part)
+        algorithm = FunctionChecksum(checksum.hashfunc, width, takes_raw_copy)
         seals.append({"field": member.name, "algorithm": algorithm, "over": ".".join(names)})
         found.append(
             construct.Renamed(checksum.checksumfield, newname=member.name, newdocs=member.docs)
@@ -90,10 +96,10 @@ def extract_seals(members: Sequence[Construct]) -> tuple[list[Construct], list[d
 
 
 def seal(struct: Construct, seals: Sequence[dict[str, Any]]) -> Construct:
-    """Return a struct inside a `SealedStruct` for each checksum.
+    """Wrap a struct in one `SealedStruct` for each checksum, one inside another.
 
     Args:
-        seals: the arguments of each `SealedStruct`.
+        seals: the arguments of each `SealedStruct`, the innermost first.
     """
     for arguments in seals:
         struct = SealedStruct.plugin_class(struct, **arguments)
@@ -106,8 +112,8 @@ def _find_covered_part(
     """Find the RawCopy that a checksum covers, or return None.
 
     Returns:
-        The names that lead to the RawCopy, and whether the function of the checksum takes the whole
-        value of the RawCopy.
+        The names that lead to the RawCopy, and whether the function of the checksum is called with
+        the Container of the RawCopy instead of its bytes.
     """
     if not isinstance(checksum, construct.Checksum):
         return None
@@ -138,7 +144,7 @@ def _is_raw_copy(members: Sequence[Construct], names: Sequence[str]) -> bool:
 
 
 def _strip(con: Construct) -> Construct:
-    """Return a construct without its name and without a length before it."""
+    """Return a construct without its name; for a Prefixed, return its content."""
     while isinstance(con, construct.Renamed | construct.Prefixed | BoundedPart):
         con = con.subcon
     return con

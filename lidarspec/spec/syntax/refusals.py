@@ -21,8 +21,8 @@ from lidarspec.spec.syntax.replacements import (
 from lidarspec.spec.syntax.structs import (
     GREEDY,
     RECODING,
-    author_class,
     children,
+    declared_class_name,
     fixed_size,
     is_greedy,
     unwrap,
@@ -95,11 +95,12 @@ def check_struct(con: Construct) -> SpecError | None:
     """Raise `SpecError` if a construct cannot describe a frame.
 
     Returns:
-        An error if the frames have no end in a byte stream, else None.
+        An error if the last part of the frame has no end in a byte stream, else None. The error is
+        not raised, because such frames are valid in datagrams.
 
     Raises:
-        SpecError: for a shadowed, reserved, duplicate or missing name, or for a construct that
-            loses bits or has no end.
+        SpecError: for a shadowed, reserved, duplicate or missing name, for a construct that loses
+            bits, or for a part without an end that is followed by other parts.
     """
     endless = _check_ends(con, "", bounded=False)
     constructs = list(_iter_constructs(con, "", in_bits=False))
@@ -123,12 +124,13 @@ def check_struct(con: Construct) -> SpecError | None:
 
 
 def _check_class(part: Construct, path: str, *, in_bits: bool) -> None:
-    """Raise SpecError for a part of a class that is not supported."""
+    """Raise SpecError if the class of a part is not supported."""
     lost = try_values(part).lost if is_int_adapter(part) else None
     if lost is not None and not isinstance(part, construct.FlagsEnum):
         raw, back = lost
         reason = (
-            f"{author_class(part)} changes {raw} to {back!r:.80} when a parsed frame is built again"
+            f"{declared_class_name(part)} changes {raw} to {back!r:.80} when a parsed frame is"
+            " built again"
         )
         raise SpecError(reason, path=path, rule="LS106")
     for kind, (rule, reason) in _REFUSED.items():
@@ -166,8 +168,8 @@ def _check_ends(
     if isinstance(con, (*GREEDY, *RECODING)) and not bounded:
         what = "count" if isinstance(con, construct.GreedyRange) else "length"
         reason = (
-            f"{author_class(con)} has no end in a stream: declare a {what} or a terminator, or"
-            " use Prefixed or FixedSized"
+            f"{declared_class_name(con)} has no end in a stream: declare a {what} or a terminator,"
+            " or use Prefixed or FixedSized"
         )
         endless = SpecError(reason, path=path, rule="LS111")
         if not is_last:
@@ -186,7 +188,7 @@ def _check_ends(
         isinstance(con, _BOUNDED_KINDS)
         and not is_held
         and not fits
-        and not _reads_all_bytes(con.subcon, padded=is_sized)
+        and not _keeps_all_bytes(con.subcon, padded=is_sized)
     ):
         name = "Prefixed" if isinstance(con, BoundedPart) else type(con).__name__
         if isinstance(con, BoundedPart | construct.NullTerminated):
@@ -201,17 +203,18 @@ def _check_ends(
     return endless
 
 
-def _reads_all_bytes(con: Construct, *, padded: bool) -> bool:
-    """Return whether parsing and building keep all bytes of a part of known size.
+def _keeps_all_bytes(con: Construct, *, padded: bool) -> bool:
+    """Return whether a part of known size is parsed and built without a loss of bytes.
 
     Args:
-        padded: whether a part that is too short is padded with zeros.
+        con: the content of the part.
+        padded: whether construct fills the part with zeros if the built content is too short.
     """
     if isinstance(con, construct.NullStripped):
         return padded and con.pad == b"\0" and con.subcon is construct.GreedyBytes
     if isinstance(con, (Array, *_BOUNDED_KINDS)) or not children(con):
         return con is construct.GreedyBytes
-    return isinstance(con, construct.GreedyRange) or _reads_all_bytes(
+    return isinstance(con, construct.GreedyRange) or _keeps_all_bytes(
         children(con)[-1], padded=padded
     )
 
@@ -239,7 +242,7 @@ def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
             continue
         if name is None:
             if in_bits or not isinstance(unwrap(child), Const):
-                kind = author_class(unwrap(child))
+                kind = declared_class_name(unwrap(child))
                 reason = f"an unnamed {kind} would lose its value: give it a name"
                 raise SpecError(reason, path=path, rule="LS105")
             continue
@@ -269,23 +272,29 @@ def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
 def _check_measures(
     con: Construct,
     path: str,
-    measure: tuple[float, float, str],
-    measures_by_path: dict[str, tuple[float, float, str]],
+    scale_and_unit: tuple[float, float, str],
+    found_by_path: dict[str, tuple[float, float, str]],
 ) -> None:
-    """Raise SpecError for a field whose branches have different scales or units."""
+    """Raise SpecError if a field has different scales or units in several branches.
+
+    Args:
+        scale_and_unit: the scale, the offset and the unit that `con` has if it is a number.
+        found_by_path: the scale, the offset and the unit of the fields that were checked before, by
+            path; the function adds the fields of `con`.
+    """
     if isinstance(con, construct.Renamed):
         if path:
             path = f"{path}.{con.name}"
         else:
             path = str(con.name)
-        measure = (1, 0, "")
+        scale_and_unit = (1, 0, "")
     if isinstance(con, DescribedField):
         described = con.describe(tree.FieldInfo(""))
-        measure = (described.scale, described.offset, described.unit)
+        scale_and_unit = (described.scale, described.offset, described.unit)
     is_number = isinstance(
         con, construct.FormatField | construct.BytesInteger | construct.BitsInteger
     )
-    if is_number and measures_by_path.setdefault(path, measure) != measure:
+    if is_number and found_by_path.setdefault(path, scale_and_unit) != scale_and_unit:
         raise SpecError(
             "the branches have different scales or units: give the field a different name in"
             " each branch",
@@ -293,7 +302,7 @@ def _check_measures(
         )
     for child in children(con):
         if not isinstance(con, Struct) or child.name is not None:
-            _check_measures(child, path, measure, measures_by_path)
+            _check_measures(child, path, scale_and_unit, found_by_path)
 
 
 def _iter_constructs(

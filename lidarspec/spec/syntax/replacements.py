@@ -1,8 +1,11 @@
 """The classes of a prepared struct: replacements for construct's, and new classes.
 
 `prepare` replaces a class of construct if the class loses bytes, does not report the offset of an
-error, or cannot parse without verification. Most frames are read without these classes.
-`tests/frames/test_plain.py` fails if a replacement is missing.
+error, or always verifies values, so that `parse(verify=False)` would be impossible.
+
+Most frames have a layout and are read and built without construct, so these classes run only for
+frames without a layout (`lidarspec.frames.plain`). `tests/frames/test_plain.py` reads such frames,
+and fails if a class is not replaced.
 
 Plugins use the new classes through `lidarspec.spec.fields`.
 """
@@ -40,7 +43,10 @@ Fault = construct.ConstructError
 
 
 class MismatchError(construct.ConstructError):  # type: ignore[misc]
-    """A value contradicts the spec; the engine converts it to a `WireError`."""
+    """Raised for a value that contradicts the spec.
+
+    The engine converts this error to a `WireError`.
+    """
 
     def __init__(self, path: str, offset: int, expected: object, got: object, reason: str) -> None:
         super().__init__(f"{reason}: expected {expected}, got {got}", path=path)
@@ -72,11 +78,18 @@ def is_verifying(context: Any) -> bool:
 def check_bound(number: int, limit: int, what: str, path: str) -> int:
     """Return a count or length after checking that a frame can have it.
 
+    Args:
+        what: the name of the number in the error message, for example "count".
+
     Raises:
         construct.RangeError: if the number is negative or larger than `limit`.
     """
-    if not 0 <= number <= limit:
-        raise construct.RangeError(f"invalid {what} {number}", path=path)
+    if number < 0:
+        raise construct.RangeError(f"the {what} {number} is negative", path=path)
+    if number > limit:
+        raise construct.RangeError(
+            f"the {what} {number} is larger than the limit, {limit}", path=path
+        )
     return number
 
 
@@ -154,10 +167,13 @@ class MeasuredStruct(Struct):  # type: ignore[misc]
 
 # construct's Array takes minutes if an invalid count is large and its elements have no bytes.
 class IndexedArray(Array):  # type: ignore[misc]
-    """An Array that limits its elements, and reports the index of an invalid element.
+    """An Array that does not parse more than `limit` elements.
+
+    The path of an error in an element includes the index of the element.
 
     Attributes:
-        limit: the maximum size of a frame, in bytes, or in bits inside a bit block.
+        limit: the maximum size of a frame, in bytes, or in bits inside a bit block. A frame cannot
+            contain more elements than this.
         in_bits: whether the array is inside a bit block.
     """
 
@@ -223,8 +239,8 @@ def _build_elements(
     return built
 
 
-class CheckedConst(Const):  # type: ignore[misc]
-    """A Const that can be parsed without verification."""
+class SkippableConst(Const):  # type: ignore[misc]
+    """A Const that is not verified by ``parse(verify=False)``."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
@@ -260,7 +276,7 @@ class LimitedNumber(Subconstruct):  # type: ignore[misc]
 
 
 class SkippableCheck(construct.Check):  # type: ignore[misc]
-    """A Check that can be parsed without verification, for ``parse(verify=False)``."""
+    """A Check that is not verified by ``parse(verify=False)``."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         if is_verifying(context):
@@ -319,7 +335,10 @@ class ExactFloat(FormatField):  # type: ignore[misc]
 # If a frame is built from the number, construct's Enum gives expressions the number, so the key of
 # a Switch matches no case.
 class NamedEnum(construct.Enum):  # type: ignore[misc]
-    """An Enum that expressions compare by name, in parsed and in built frames."""
+    """An Enum whose value is a name in expressions, as in ``this.mode == "dual"``.
+
+    The value equals the name also while a frame is built from the number.
+    """
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         raw = self._encode(obj, context, path)
@@ -329,7 +348,10 @@ class NamedEnum(construct.Enum):  # type: ignore[misc]
 
 # construct's RawCopy builds from `data`, and ignores a changed `value`.
 class RawPart(Construct):  # type: ignore[misc]
-    """A part with its bytes and offsets, like construct's RawCopy, built from `value`."""
+    """A part that is parsed to its value, bytes and offsets, like construct's RawCopy.
+
+    The part is built from the entry `value`, and from the entry `data` only if `value` is missing.
+    """
 
     def __init__(self, subcon: Construct) -> None:
         super().__init__()
@@ -368,8 +390,8 @@ class RawPart(Construct):  # type: ignore[misc]
         return int(self.subcon._sizeof(context, path))
 
 
-class CheckedChecksum(construct.Checksum):  # type: ignore[misc]
-    """A Checksum that can be parsed without verification."""
+class SkippableChecksum(construct.Checksum):  # type: ignore[misc]
+    """A Checksum that is not verified by ``parse(verify=False)``."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
@@ -402,7 +424,8 @@ class CheckedCompressed(construct.Compressed):  # type: ignore[misc]
             raise
         except Exception as error:  # each compression library has its own exceptions
             expected = f"bytes compressed by {self.encoding}"
-            raise MismatchError(path, start, expected, "other bytes", "value") from error
+            got = "bytes that cannot be decompressed"
+            raise MismatchError(path, start, expected, got, "value") from error
 
 
 class Reserved(CountedBytes):
@@ -454,8 +477,9 @@ class SizeField(Subconstruct):  # type: ignore[misc]
     Attributes:
         of: the names that lead from the struct with this field to the part; "_" leads to the outer
             struct.
-        plus: a number that is added to the size.
-        since: the name of an earlier member from which bytes are counted; "" for the part alone.
+        plus: a number that is added to the size to give the value of the field.
+        since: the name of a member before the part. The size is then counted from the start of this
+            member to the end of the part. "" counts the part alone.
     """
 
     def __init__(

@@ -1,4 +1,8 @@
-"""Prepare a plugin's struct, find properties of constructs, draw random values."""
+"""Functions that work on the constructs of a plugin's struct.
+
+`prepare` replaces construct's classes in the struct. Other functions find properties of constructs,
+and draw random values that a construct can build.
+"""
 
 from __future__ import annotations
 
@@ -31,9 +35,7 @@ from lidarspec.spec.syntax.raw_checksums import extract_seals, seal
 from lidarspec.spec.syntax.replacements import (
     BareNamedTuple,
     BoundedPart,
-    CheckedChecksum,
     CheckedCompressed,
-    CheckedConst,
     CountedBytes,
     CountField,
     DescribedField,
@@ -53,6 +55,8 @@ from lidarspec.spec.syntax.replacements import (
     SealedStruct,
     SizeField,
     SkippableCheck,
+    SkippableChecksum,
+    SkippableConst,
     check_bound,
 )
 
@@ -66,7 +70,7 @@ if TYPE_CHECKING:
 _REPLACEMENTS: dict[type, type] = {
     Struct: MeasuredStruct,
     Array: IndexedArray,
-    Const: CheckedConst,
+    Const: SkippableConst,
     construct.Enum: NamedEnum,
     construct.GreedyRange: FullRange,
     construct.NullTerminated: FastNullTerminated,
@@ -135,7 +139,7 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
         return RawPart(prepare(con.subcon, limit, in_bits=in_bits))
     if isinstance(con, construct.Checksum):
         field = prepare(con.checksumfield, limit, in_bits=in_bits)
-        return CheckedChecksum(field, con.hashfunc, con.bytesfunc)
+        return SkippableChecksum(field, con.hashfunc, con.bytesfunc)
     if isinstance(con, construct.Padded):
         padded = _replace_padding(con, in_bits=in_bits)
         if padded is not None:
@@ -313,11 +317,13 @@ def find_xor_key(con: construct.ProcessXor) -> bytes | None:
 
 
 def _name_field(con: Construct, ending: str, field: Construct, what: str) -> Construct:
-    """Return a hidden field, named and documented by the name of a member.
+    """Return `field` with a name and documentation that contain the name of a member.
 
     Args:
-        ending: the text after the member's name in the name of the field.
-        what: the text before the member's name in the documentation of the field.
+        con: the member of the struct.
+        ending: the text after the member's name in the name of the field, such as "_size".
+        field: a field for bytes that construct does not show as a value, such as a length.
+        what: the text before the member's name in the documentation, such as "bytes of".
     """
     return construct.Renamed(field, newname=con.name + ending, newdocs=f"{what} {con.name}")
 
@@ -351,7 +357,11 @@ def _expand_prefixed(con: Construct, inner: construct.Prefixed) -> list[Construc
 
 
 def _expand_focused(con: Construct, inner: construct.FocusedSeq) -> list[Construct]:
-    """Return the members that replace a FocusedSeq: its value, and its other parts."""
+    """Return the members that replace a FocusedSeq.
+
+    The part in focus gets the name of the FocusedSeq, and the other parts become fields of their
+    own. If this is impossible, the FocusedSeq is returned as the only member.
+    """
     focus = inner.parsebuildfrom
     parts = {part.name: _strip_name(part) for part in inner.subcons}
     others = [part for part in inner.subcons if part.name != focus]
@@ -384,7 +394,10 @@ COUNT_TRIALS = (0, 1, 3, *((1 << bit) - 1 for bit in range(3, 17)))
 
 
 def _to_count_field(member: Construct, later: Sequence[Construct]) -> Construct:
-    """Return a `CountField` if a member counts the elements of a later member."""
+    """Return a `CountField` for a member that counts the elements of a later member.
+
+    Any other member is returned unchanged.
+    """
     content = _strip_name(member)
     if not member.name or not isinstance(content, construct.Rebuild):
         return member
@@ -620,7 +633,10 @@ def is_independent(con: Construct, kinds: tuple[type, ...] = _INDEPENDENT_KINDS)
 
 
 def to_public(parsed: Any) -> Any:
-    """Return a parsed object without private entries, and with `EnumValue`s."""
+    """Return a parsed object without private entries.
+
+    Construct's values of an Enum are replaced by `EnumValue`.
+    """
     if isinstance(parsed, dict):
         return Container(
             {name: to_public(value) for name, value in parsed.items() if not name.startswith("_")}
@@ -644,8 +660,11 @@ def field_path(path: str | None) -> str:
     return ".".join(names)
 
 
-def author_class(con: Construct) -> str:
-    """Return the name of the class that the plugin used, before `prepare` replaced it."""
+def declared_class_name(con: Construct) -> str:
+    """Return the name of the construct class that the plugin's struct declares.
+
+    If `prepare` has replaced the class, this is the name of the replaced class.
+    """
     classes = type(con).__mro__
     own = [kind for kind in classes if not kind.__module__.startswith("lidarspec.spec.syntax")]
     return own[0].__name__
@@ -683,7 +702,10 @@ def iter_leaves(
 
 
 def is_expression(value: object) -> bool:
-    """Return whether a value is an expression or a construct, and not a number."""
+    """Return whether a value is an expression of construct, such as `this.a > 1`.
+
+    A construct itself also counts as an expression: both have no value without a frame.
+    """
     return isinstance(value, ExprMixin | Construct)
 
 
@@ -798,7 +820,11 @@ def _count_elements(con: Construct, scope: Any) -> int:
 def _draw_parts(
     con: Partition, source: random.Random, drawn: Drawn, scope: Any, path: str
 ) -> ParsedParts:
-    """Return random parts, with the sizes that expressions of later fields read."""
+    """Return random parts.
+
+    Each part is built, because expressions of later fields may use the total size of the parts
+    (`ParsedParts.size`).
+    """
     parts = ParsedParts()
     around = Container(
         {**scope, "_params": Container(), "_parsing": False, "_building": True, "_sizing": False}
@@ -829,7 +855,7 @@ def _draw_leaf(con: Construct, source: random.Random, scope: Any, path: str) -> 
         return str(source.randrange(10 ** source.randint(1, 4))).encode()
     if isinstance(con, construct.Computed):
         return construct.evaluate(con.func, scope)
-    if isinstance(con, CheckedChecksum):
+    if isinstance(con, SkippableChecksum):
         return None  # computed when the frame is built
     if con is construct.GreedyBytes:
         return source.randbytes(source.randint(0, 4))
