@@ -1,7 +1,7 @@
 """Check a sensor, a file or a distribution with every property and every rule.
 
-`find_target` finds the sensors to check, and `iter_reports` checks them. `check_texts` finds
-mistakes in the source of a plugin that are valid Python.
+`find_target` finds the sensors to check, and `iter_reports` checks them. `check_texts` searches a
+plugin's source for code that is valid Python but a mistake, such as `if this.n == 1`.
 """
 
 from __future__ import annotations
@@ -62,14 +62,15 @@ class CheckTarget:
 
 
 def find_target(text: str | Path) -> CheckTarget:
-    """Find the sensors to check by the name that the user typed.
+    """Return the sensors that `lidarspec check` checks for a name.
 
-    The name is a file, a sensor of a file ("FILE.py:id"), the id or alias of an installed sensor, a
-    distribution, or the folder of a distribution.
+    Args:
+        text: a file, a sensor of a file ("FILE.py:id"), the id or alias of an installed sensor, a
+            distribution, or the folder of a distribution.
 
     Raises:
-        SourceError: for a file that does not exist, or the folder of a distribution that is not
-            installed from it.
+        SourceError: for a file that does not exist, or for a folder if the distribution is not
+            installed from this folder.
         UnknownSensor: for any other name.
     """
     name = str(text)
@@ -477,10 +478,7 @@ def _iter_mistakes(
             ) and _is_silent(node.body):
                 yield (
                     "LS801",
-                    (
-                        f"except {ast.unparse(node.type) if node.type else ''}:"
-                        f" {ast.unparse(node.body[0])}"
-                    ),
+                    f"`{_format_handler(node)}` ignores the exception",
                     node,
                 )
             case ast.Call() if ast.unparse(node.func) in WALL_CLOCKS:
@@ -493,7 +491,18 @@ def _iter_mistakes(
                 yield "LS803", f"the result of {ast.unparse(call.func)} is not used", node
         for test in _list_tests(node):
             if _is_expression(test, expressions):
-                yield "LS804", f"Python tests whether `{ast.unparse(test)}` is true", test
+                yield (
+                    "LS804",
+                    f"`{ast.unparse(test)}` is an expression of construct, which Python always"
+                    " treats as true",
+                    test,
+                )
+
+
+def _format_handler(handler: ast.ExceptHandler) -> str:
+    """Return the first two lines of an exception handler as one line."""
+    kind = f" {ast.unparse(handler.type)}" if handler.type else ""
+    return f"except{kind}: {ast.unparse(handler.body[0])}"
 
 
 def _find_expression_names(tree: ast.Module) -> set[str]:
@@ -571,8 +580,10 @@ class Report:
         name: the sensor's id, or the checked name if the report is about loading errors.
         findings: the findings.
         skipped: property -> the reason why it does not apply.
-        measured: measured values of frames, by description.
-        picture: measured values of points, by description.
+        measured: results of measurements of frames as text, by what was measured.
+        picture: results of measurements of points as text, by what was measured, for example
+            "data: rate" -> "4500 points per second, simulated". The author compares them with the
+            manual.
     """
 
     name: str

@@ -21,15 +21,18 @@ STAMP_TOLERANCE_NS = 1000
 def assert_well_formed(cloud: PointCloud) -> None:
     """Fail unless the cloud keeps the conventions of types, angles and REP-117."""
     valid = cloud.valid
-    assert cloud.x.dtype == cloud.y.dtype == cloud.z.dtype == cloud.range.dtype == np.float32
-    assert cloud.time.dtype == np.float64
-    assert all(len(column) == len(cloud) for column in cloud.columns.values())
-    assert np.isfinite(cloud.xyz[valid]).all()
-    assert np.isfinite(cloud.range[valid]).all()
-    assert np.isnan(cloud.xyz[~valid]).all()
-    assert (cloud.range[valid] >= 0).all()
+    lengths = (cloud.x, cloud.y, cloud.z, cloud.range)
+    assert all(column.dtype == np.float32 for column in lengths), "x, y, z or range is not float32"
+    assert cloud.time.dtype == np.float64, "time is not float64"
+    assert all(len(column) == len(cloud) for column in cloud.columns.values()), (
+        "a column has another length than the cloud"
+    )
+    assert np.isfinite(cloud.xyz[valid]).all(), "x, y or z of a valid point is not finite"
+    assert np.isfinite(cloud.range[valid]).all(), "the range of a valid point is not finite"
+    assert np.isnan(cloud.xyz[~valid]).all(), "x, y or z of an invalid point is not nan"
+    assert (cloud.range[valid] >= 0).all(), "the range of a valid point is negative"
     finite = cloud.azimuth[np.isfinite(cloud.azimuth)]
-    assert ((finite >= -np.pi) & (finite < np.pi)).all()
+    assert ((finite >= -np.pi) & (finite < np.pi)).all(), "an azimuth is not in [-pi, pi)"
 
 
 def assert_same_places(cloud: PointCloud, other: PointCloud, *, ulps: int = ULPS) -> None:

@@ -86,7 +86,10 @@ def _check_parses_back(sensor: Sensor, name: str, arguments_given: dict[str, flo
         read = get_nested(parsed, declared.path)
         if declared.path in command.templates:
             texts = command.templates[declared.path].match(read)
-            assert texts is not None, f"{declared.path} does not match its template"
+            template = command.templates[declared.path].text
+            assert texts is not None, (
+                f"{declared.path} is {read!r}, which does not match the template {template!r}"
+            )
             read = texts[argument].encode()
             if isinstance(declared.kind, Range):
                 read = float(read)
@@ -127,10 +130,17 @@ def arguments_outside_ranges_are_errors(subject: SensorUnderTest, name: str) -> 
 def an_exchange_holds(
     sensor: Sensor, name: str, given: dict[str, Any], data: bytes, answer: bytes | None, path: str
 ) -> None:
-    """Check that a command is built as `data`, and that `answer` is a reply to it.
+    """Check that a command and its reply agree with a golden vector.
+
+    Args:
+        given: the arguments of the command, by name.
+        data: the bytes of the command in the vector.
+        answer: the bytes of the reply in the vector; None if the vector has no reply.
+        path: the entry of the vector, for the error.
 
     Raises:
-        ViolationError: if the bytes differ, or the reply does not match.
+        ViolationError: if the command is built with other bytes, or if `answer` is not recognized
+            as a reply to the command.
     """
     command = sensor.commands[name]
     try:
@@ -160,7 +170,10 @@ def an_exchange_holds(
 
 
 def replies_can_match(subject: SensorUnderTest, name: str) -> None:
-    """Check that a reply of the command has the fields by which it is recognized."""
+    """Check that each field by which replies are recognized exists in a reply of the command.
+
+    One of the reply types that the command declares has to have the field.
+    """
     command = subject.sensor.commands[name]
     answers = [subject.fields(reply) for reply in command.replies]
     for path in (*command.matches, *command.echoes) if answers else ():

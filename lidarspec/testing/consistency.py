@@ -1,4 +1,8 @@
-"""Checks that the parts of a declaration agree: angles, points, clock and times."""
+"""Checks that the parts of a declaration agree: angles, points, clock and times.
+
+The sweep is `Simulation.sweep`, a function of the packet number that returns the angles, the
+counters and the time of a simulated packet.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +42,7 @@ SHIFT_COUNT = 24
 
 
 def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
-    """Check that the clock stays below `wraps_at` in packets far into the sweep."""
+    """Check that the clock stays below `wraps_at` in packets of the sweep with high numbers."""
     clock = subject.sensor.clock
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None or not isinstance(clock, Clock) or clock.wraps_at is None:
@@ -62,7 +66,6 @@ def sweep_values_fit_their_fields(subject: SensorUnderTest, name: str) -> None:
     if sweep is None:
         return
     fields = get_codec(subject.sensor.frames[name]).schema.fields
-    # Other unsigned fields may be counters and clocks, which wrap.
     checked = {path: info for path, info in fields.items() if _is_limited(info)}
     for number in range(FITTED_PACKETS):
         for path, value in sweep(number).items():
@@ -81,7 +84,10 @@ def sweep_values_fit_their_fields(subject: SensorUnderTest, name: str) -> None:
 
 
 def _is_limited(info: FieldInfo) -> bool:
-    """Return whether a field is an integer that does not wrap like a counter or a clock."""
+    """Return whether a field is an integer that must not exceed its range.
+
+    These are signed integers and angles. All other integers may be counters or clocks, which wrap.
+    """
     if info.dtype is None or info.dtype.kind not in "iu":
         return False
     return info.dtype.kind == "i" or info.unit in FULL_TURNS
@@ -223,7 +229,10 @@ def _read_azimuths(
 def _angles_between(
     first: NDArray[np.float64] | None, second: NDArray[np.float64] | None
 ) -> NDArray[np.float64] | None:
-    """Return the differences of two arrays of azimuths in radians, or None."""
+    """Return the differences of the finite azimuths of two arrays, in radians, -pi to pi.
+
+    Returns None if an array is None, or if the shapes differ.
+    """
     if first is None or second is None or first.shape != second.shape:
         return None
     finite = np.isfinite(first) & np.isfinite(second)

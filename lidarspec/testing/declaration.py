@@ -28,7 +28,7 @@ from lidarspec.spec.syntax import is_expression
 from lidarspec.spec.timing import DAY_S
 from lidarspec.spec.tree import NAME_IS_COMPARED, Sealed, Struct, infos, nodes
 from lidarspec.testing.findings import Finding
-from lidarspec.testing.geometry import find_field_of_node, find_fields, trace_points
+from lidarspec.testing.geometry import find_field_of_node, find_source_nodes, trace_points
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 #: Names of fields that hold a measured value.
@@ -100,10 +100,10 @@ def check_declaration(subject: SensorUnderTest) -> list[Finding]:
 
 def _check_sensor(sensor: Sensor) -> Findings:
     if PLACEHOLDER.fullmatch(sensor.source):
-        yield "LS202", f"source is {sensor.source!r}", ""
+        yield "LS202", f"`source` is {sensor.source!r}, which does not name a document", ""
     for name in ("vendor", "model"):
         if not getattr(sensor, name).strip():
-            yield "LS211", f"{name} is empty", ""
+            yield "LS211", f"the sensor's `{name}` is empty", ""
     if "data" not in sensor.links:
         yield "LS211", "the link 'data' is missing", "links"
     if sensor.points is not None and not sensor.has_points:
@@ -152,12 +152,14 @@ def _check_required_fields(sensor: Sensor) -> Findings:
     if status is not None and isinstance(status.source, str):
         path = without_indices(status.source)[0]
         if path not in status_paths:
-            what = f"no field {status.source!r}{did_you_mean(path, status_paths)}"
-            yield "LS216", what, "clock.status"
+            hint = did_you_mean(path, status_paths)
+            what = f"the status of the clock needs the field {status.source!r}, which is missing"
+            yield "LS216", f"{what}{hint}", "clock.status"
     for purpose, path in given:
         allowed = cut_by if purpose == "scan" else field_paths
         if path and without_indices(path)[0] not in allowed:
-            yield "LS216", f"no field {path!r}{did_you_mean(path, allowed)}", purpose
+            what = f"`{purpose}` needs the field {path!r}, which is missing"
+            yield "LS216", f"{what}{did_you_mean(path, allowed)}", purpose
 
 
 def _check_clock(sensor: Sensor) -> Findings:
@@ -344,11 +346,14 @@ def _check_names(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
 
 
 def _find_range_fields(subject: SensorUnderTest, name: str) -> set[str]:
-    """Return the source fields of `range`; an empty set if none is a length."""
+    """Return the paths of the fields from which the column `range` is calculated.
+
+    Returns an empty set if none of these fields is a length.
+    """
     try:
         infos = [
             find_field_of_node(subject, name, node)
-            for node in find_fields(getattr(trace_points(subject, name), "range", None))
+            for node in find_source_nodes(getattr(trace_points(subject, name), "range", None))
         ]
     except Exception:  # another check reports it
         return set()
@@ -457,7 +462,7 @@ def _check_sync(
     chance = MAX_SYNC_SHARE + 4 * (MAX_SYNC_SHARE / len(matching)) ** 0.5
     share = expected if expected > MAX_SYNC_SHARE else share
     if expected > MAX_SYNC_SHARE or share > chance:
-        what = f"the constant bytes occur at {share:.1%} of the offsets in the content"
+        what = f"the constant bytes also occur at {share:.1%} of the offsets in the frame's content"
         yield "LS204", what, name
 
 
@@ -484,7 +489,10 @@ def _check_strength(
 
 
 def _find_max_weak_bits(sensor: Sensor, frame: Frame) -> int:
-    """Return the largest number of constant and checksum bits of a weak frame."""
+    """Return the highest number of constant and checksum bits that is too low for a frame.
+
+    A frame with so few bits is too easily confused with other bytes.
+    """
     if sensor.datagrams:
         return WEAK_BITS_IN_DATAGRAMS
     if frame.data:
@@ -511,7 +519,7 @@ def _check_intensity(subject: SensorUnderTest, name: str, result: Any) -> Findin
     """Yield a finding if the intensity seems to come from the wrong field."""
     own = [
         find_field_of_node(subject, name, node)
-        for node in find_fields(getattr(result, "intensity", None))
+        for node in find_source_nodes(getattr(result, "intensity", None))
     ]
     if not own or any(info is None or INTENSITY_NAMES.search(info.path) for info in own):
         return
@@ -519,12 +527,12 @@ def _check_intensity(subject: SensorUnderTest, name: str, result: Any) -> Findin
     taken = {
         info.path
         for value in columns
-        for node in find_fields(value)
+        for node in find_source_nodes(value)
         if (info := find_field_of_node(subject, name, node)) is not None
     }
     ranges = [
         info
-        for node in find_fields(getattr(result, "range", None))
+        for node in find_source_nodes(getattr(result, "range", None))
         if (info := find_field_of_node(subject, name, node)) is not None
     ]
     axes = {info.axes for info in ranges if info.axes}
@@ -584,7 +592,8 @@ def _check_column(
 ) -> Findings:
     """Yield a finding if no source field of a column has one of these units."""
     infos = [
-        find_field_of_node(subject, name, node) for node in find_fields(value, looked_up=False)
+        find_field_of_node(subject, name, node)
+        for node in find_source_nodes(value, include_indices=False)
     ]
     measured = [info for info in infos if info is not None and factor(info.unit, "m") is not None]
     if column == "range" and measured and all(CODE_NAMES.fullmatch(info.name) for info in measured):

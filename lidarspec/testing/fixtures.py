@@ -37,7 +37,8 @@ def virtual_port(
         link: the name of a symbolic link to the pseudo-terminal, which stays valid when the sensor
             is unplugged; by default a link in a temporary folder.
         scene: the surroundings of the sensor; by default a random room with a walking person.
-        seed: seed of the scene, the faults and the fillers.
+        seed: seed of the scene, the faults and the bytes that the sensor sends in pauses
+            (`Sensor.fillers`).
         rate: speed relative to real time; with `inf`, the sensor sends as fast as the reader reads.
         faults: the faults to simulate on the links of the sensor.
         virtual_time: whether the sensor's time passes only in calls of `advance`.

@@ -107,7 +107,7 @@ def bytes_survive_parsing_and_building(subject: SensorUnderTest, name: str) -> N
             require(
                 are_equal(parsed, again),
                 "LS302",
-                "parsing the built frame gives a different value",
+                "a parsed frame is built again, and parsing the built frame gives other values",
                 name,
             )
 
@@ -155,7 +155,7 @@ def _require_same_values(parsed: Any, again: Any, sealed: set[str], name: str) -
         is_number = isinstance(before, int | float) and re.sub(r"\[\d+\]", "", path) not in sealed
         if path == other and is_number and not are_equal(before, after):
             raise ViolationError(
-                "LS303" if is_cut(before, after) else "LS302",
+                "LS303" if is_rounded_down(before, after) else "LS302",
                 f"the value {before!r} becomes {after!r} when the parsed frame is built again",
                 f"{name}.{path}",
             )
@@ -193,8 +193,12 @@ def wrong_rebuild_values_are_invalid(subject: SensorUnderTest, name: str) -> Non
                 )
 
 
-def is_cut(before: Any, after: Any) -> bool:
-    """Return whether a number was truncated: `after` is lower by at most one step."""
+def is_rounded_down(before: Any, after: Any) -> bool:
+    """Return whether a number has become a little lower, as if it was truncated.
+
+    An integer must be lower by exactly 1. A float must be lower by less than 1 plus a tenth of its
+    value.
+    """
     if (
         not isinstance(before, int | float)
         or not isinstance(after, int | float)
@@ -317,7 +321,7 @@ def _raise_changed_bytes(
         )
     path, before, after = difference
     raise ViolationError(
-        "LS303" if is_cut(before, after) else code,
+        "LS303" if is_rounded_down(before, after) else code,
         f"the value {before!r} becomes {after!r} when the parsed frame is built again",
         f"{name}.{path}",
     )

@@ -1,7 +1,8 @@
 """Checks of a sensor's points that are possible without its manual.
 
-Four kinds of frames are used: random examples, packets of the sensor's `sweep`, frames with a
-changed angle, and packets that are simulated in a room.
+Four kinds of frames are used: random examples, packets of the sensor's sweep, frames with a changed
+angle, and packets that are simulated in a room. The sweep is `Simulation.sweep`, a function of the
+packet number that returns the angles, the counters and the time of a simulated packet.
 
 The measured values are reported (`SensorUnderTest.picture`), so that the author can compare them
 with the manual.
@@ -88,9 +89,9 @@ MIN_HALF_STEP_M = 0.004
 def make_sweep(
     subject: SensorUnderTest, name: str, packets: int, total: int = MAX_SWEEP_BYTES
 ) -> list[bytes]:
-    """Return the first packets of the sensor's `sweep`.
+    """Return simulated packets with the values of the sensor's sweep, from packet 0.
 
-    Returns an empty list if there is no `sweep` or the frame type is not compiled.
+    Returns an empty list if there is no sweep or the frame type is not compiled.
 
     Args:
         packets: maximum number of packets.
@@ -118,7 +119,8 @@ def decode_frames(
     """Decode frames of one data type.
 
     Args:
-        by_clock: whether the clock of the sensor is used.
+        by_clock: whether the times of packets are those of the sensor's clock; False to ignore the
+            clock, so that it cannot compensate for errors of the packet counter.
     """
     if by_clock:
         sensor = subject.sensor
@@ -156,14 +158,14 @@ def _trace_points(subject: SensorUnderTest, name: str) -> Any:
     )[0]
 
 
-def find_fields(*values: Any, looked_up: bool = True) -> list[Node]:
-    """Return the field nodes from which traced values are calculated.
+def find_source_nodes(*values: Any, include_indices: bool = True) -> list[Node]:
+    """Return the nodes of the fields from which traced values are calculated.
 
     Args:
-        looked_up: whether to include fields that are only used as indices of a table.
+        include_indices: whether to include fields that are only used as indices of a table.
     """
     nodes = traverse(
-        *values, into=lambda node: looked_up or not isinstance(node.function, TableLookup)
+        *values, into=lambda node: include_indices or not isinstance(node.function, TableLookup)
     )
     return [node for node in nodes if node.kind in ("field", "state")]
 
@@ -212,7 +214,10 @@ def calculate_directions(
 
 
 def _declared_directions(subject: SensorUnderTest, name: str) -> list[NDArray[np.float64]] | None:
-    """Return the directions that the spec declares for simulated frames; None if none."""
+    """Return the azimuths and the elevations that the spec declares for simulated frames.
+
+    Returns None if the spec declares no directions.
+    """
     declared = subject.sensor.simulation_of(name).directions
     if declared is None:
         return None
@@ -235,9 +240,7 @@ def clouds_keep_the_conventions(subject: SensorUnderTest, name: str) -> None:
     try:
         assert_well_formed(cloud)
     except AssertionError as error:
-        raise ViolationError(
-            "LS501", str(error).splitlines()[0] or "the cloud is malformed", f"{name}.points"
-        ) from error
+        raise ViolationError("LS501", str(error).splitlines()[0], f"{name}.points") from error
 
 
 def directions_are_radians(subject: SensorUnderTest, name: str) -> None:
@@ -360,7 +363,7 @@ def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
             f" {', '.join(axes or ())}, they must turn {words.get(expected)}"
         )
         # Golden vectors with points in two quadrants are better evidence than the axes.
-        is_proven = name in subject.placed
+        is_proven = name in subject.frames_with_two_quadrants
         require(is_proven or expected in (0, sense), "LS511", message, f"{name}.points")
         return
 
@@ -423,7 +426,7 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
         if abs(median) > MIN_ROTATION_STEP_RAD:
             subject.picture.setdefault(
                 f"{name}: step",
-                f"{abs(np.rad2deg(median)):.3g} deg {turning} from point to point along the sweep",
+                f"{abs(np.rad2deg(median)):.3g} deg {turning} from one simulated point to the next",
             )
         one_way = float((np.sign(steps[moving]) == np.sign(median)).mean())
         if one_way < MIN_ONE_WAY_SHARE:
@@ -464,7 +467,7 @@ def _have_equal_packets(angles: NDArray[np.float64], packets: NDArray[np.intp]) 
 
 
 def counters_run_on(subject: SensorUnderTest, name: str) -> None:
-    """Check that the counter and the clock never run backwards in the sweep."""
+    """Check that neither the counter nor the clock goes back in packets of the sweep."""
     if name != subject.sensor.data_frame:
         return
     frames = make_sweep(
@@ -525,7 +528,7 @@ def _find_point_angles(subject: SensorUnderTest, name: str) -> dict[str, FieldIn
         return angles
     if result is None:
         return angles
-    nodes = find_fields(*vars(result).values())
+    nodes = find_source_nodes(*vars(result).values())
     sources = {
         info.path for info in (find_field_of_node(subject, name, node) for node in nodes) if info
     }
@@ -533,7 +536,10 @@ def _find_point_angles(subject: SensorUnderTest, name: str) -> dict[str, FieldIn
 
 
 def _find_full_circle(info: FieldInfo) -> tuple[int, int] | None:
-    """Return the raw values of 0 and of the full circle, or None."""
+    """Return the raw values of the angle 0 and of the full circle.
+
+    Returns None if the field cannot represent both angles exactly.
+    """
     zero = _find_zero(info)
     if zero is not None:
         circle = (FULL_TURNS[info.unit] - info.offset) / info.scale
@@ -628,9 +634,10 @@ def distance_outside(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def find_half_step(subject: SensorUnderTest, name: str) -> float:
-    """Return half of the largest step of the length fields of a frame, in metres.
+    """Return the largest rounding error of a length field of a frame, in metres.
 
-    Returns `MIN_HALF_STEP_M` if no step is larger than `MIN_HALF_STEP_M`.
+    The error is half of the field's scale. Returns `MIN_HALF_STEP_M` if no length field has a scale
+    above `MIN_HALF_STEP_M`.
     """
     fields = subject.fields(name).values()
     metres = [

@@ -82,7 +82,7 @@ class Property:
         return self.function.__name__
 
     def cases(self, subject: SensorUnderTest) -> Iterable[tuple[str, ...]]:
-        """Return the arguments of each call of `function` that follow `subject`."""
+        """Return, for each call of `function`, the arguments after `subject`."""
         if self._is_tested_elsewhere(subject):
             return []
         if self.each == "sensor":

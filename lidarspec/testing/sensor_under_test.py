@@ -170,10 +170,11 @@ class SensorUnderTest:
         vectors: the file of golden vectors; None if there is no such file.
         family: the ids of the sensors that share the file of golden vectors.
         tested: related models; frame types that they share with this sensor are not tested again.
-        measured: measured values of frames as text, by description.
-        picture: measured values of points as text, by description.
+        measured: results of measurements of frames as text, by what was measured.
+        picture: results of measurements of points as text, by what was measured.
         traced: data frame -> the result of `geometry.trace_points`.
-        placed: names of the data frames whose golden vectors have points in two quadrants.
+        frames_with_two_quadrants: names of the data frames whose golden vectors have points in two
+            quadrants.
         swept: data frame -> the packets of its `sweep` that have been made so far.
     """
 
@@ -186,7 +187,7 @@ class SensorUnderTest:
     measured: dict[str, str] = field(default_factory=dict)
     picture: dict[str, str] = field(default_factory=dict)
     traced: dict[str, Any] = field(default_factory=dict, repr=False)
-    placed: set[str] = field(default_factory=set, repr=False)
+    frames_with_two_quadrants: set[str] = field(default_factory=set, repr=False)
     swept: dict[str, list[bytes]] = field(default_factory=dict, repr=False)
     _known: dict[tuple[str, int], bytes] = field(default_factory=dict, repr=False)
     _drawers: dict[str, dict[str, Callable[[random.Random], int]]] = field(
@@ -245,10 +246,10 @@ class SensorUnderTest:
         return max(1, *(len(self.example(name, seed=seed)) for seed in range(MEASURED_SEEDS)))
 
     def scale_rounds(self, rounds: int, least: int = 1) -> int:
-        """Return a number of rounds that is proportional to `examples`.
+        """Return how often a check repeats something, in proportion to `examples`.
 
         Args:
-            rounds: the number of rounds for the default number of examples.
+            rounds: the number of repetitions for the default number of examples.
             least: the minimum of the result.
         """
         return max(rounds * self.examples // USUAL_EXAMPLES, least)

@@ -236,7 +236,11 @@ def _joined_runs(
 
 @st.composite
 def _consecutive_frames(draw: DrawFn, sensor: Sensor, frame: str) -> list[bytes]:
-    """Draw consecutive frames of a type, after the frame that must precede them."""
+    """Draw consecutive frames of a type.
+
+    If the type can be decoded only after another frame (`Frame.after`), the result begins with a
+    frame of the other type.
+    """
     declared = sensor.frames[frame]
     before = [] if declared.after is None else [draw(frames(sensor, declared.after))]
     count = draw(_integers(declared.confirm, declared.confirm + 2))
@@ -266,12 +270,12 @@ def scans(sensor: str | Sensor, *, lost: int = 3) -> SearchStrategy[Scan]:
             simulated sensor sends no complete scan.
     """
     resolved = _find_sensor(sensor)
-    return _scans(resolved, _packets_per_scan(resolved), lost)
+    return _scans(resolved, _count_packets_until_scan(resolved), lost)
 
 
 @functools.lru_cache(maxsize=64)
-def _packets_per_scan(sensor: Sensor) -> int:
-    """Return the number of packets from power-on until the first complete scan ends."""
+def _count_packets_until_scan(sensor: Sensor) -> int:
+    """Return a number of packets, from power-on, that contain a complete scan."""
     count = FIRST_PACKETS
     while count <= MAX_PACKETS:
         packets = simulate(sensor, count)
@@ -513,7 +517,7 @@ def _mostly_low(low: int, high: int) -> SearchStrategy[int]:
 
 @st.composite
 def _plain_frames(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> bytes:
-    """Draw a frame value by value, if its type has parts or is not compiled."""
+    """Draw a frame of a type that has parts or is not compiled, value by value."""
     source = _DrawnNumbers(draw, find_value_ranges(sensor, frame))
     drawn = {path: functools.partial(_draw_own, strategy) for path, strategy in fields.items()}
     try:

@@ -1,7 +1,9 @@
-"""The ranges of values that are valid in one layout, for drawing field by field.
+"""Ranges of valid values, from which `lidarspec.testing.strategies` draws random frames.
 
-The range of a field contains values that are valid in one example frame, the base. Values of
-several fields may be invalid together; `LayoutRanges.repair` replaces these values.
+A header is the values of the fields on which the layout of a frame depends, such as counts. For
+each header there are ranges of the other fields. The range of a field contains the values that are
+valid in one example frame, the base. Values of several fields may be invalid together;
+`LayoutRanges.repair` leaves such values out, so that the values of the base remain.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ BATCH_BYTES = 1 << 22
 
 
 class LayoutRanges:
-    """The valid values of the fields of one layout.
+    """The valid values of the fields of frames with one header.
 
     Args:
         header: raw values of the fields that the layout depends on, by path.
@@ -71,9 +73,13 @@ class LayoutRanges:
         ]
 
     def make_struct(self, values: Mapping[str, Values], fixed: Container[str]) -> bytes | None:
-        """Return a struct with these values, invalid values replaced; None if impossible.
+        """Return the bytes of a valid struct with these values.
+
+        Values that are invalid together are replaced by values of `base`. Returns None if no struct
+        with the values of the `fixed` fields is found.
 
         Args:
+            values: the raw values of fields in `free`, by path.
             fixed: the paths of the fields whose values must not be replaced.
         """
         row = self._make_rows([values])
@@ -99,7 +105,15 @@ class LayoutRanges:
     def repair(
         self, values: Mapping[str, Values], fixed: Mapping[str, Values]
     ) -> Mapping[str, Values]:
-        """Return the fixed values, and the `values` that are valid together with them."""
+        """Return the fixed values, and those of `values` that are valid together with them.
+
+        Values that would make the struct invalid are left out. In an array, elements of `base`
+        replace the invalid elements.
+
+        Args:
+            values: the raw values of fields in `free`, by path.
+            fixed: the raw values that are always part of the result, by path.
+        """
         kept = dict(fixed)
         for leaf in self.free:
             path = leaf.info.path
@@ -168,8 +182,8 @@ class LayoutRanges:
         highest = {
             leaf.info.path: (starts[leaf.info.path], _find_limits(leaf)[1]) for leaf in leaves
         }
-        low = find_ends(lowest, self._check_values)
-        high = find_ends(highest, self._check_values)
+        low = find_nearest_valid_values(lowest, self._check_values)
+        high = find_nearest_valid_values(highest, self._check_values)
         return {path: (low[path], high[path]) for path in starts}
 
     def _shrink_base(self, leaves: Sequence[Leaf]) -> bool:
@@ -178,7 +192,7 @@ class LayoutRanges:
         for leaf in leaves:
             path = leaf.info.path
             start = int(leaf.load(self._base).flat[0])
-            end = find_ends({path: (start, 0)}, self._check_values)[path]
+            end = find_nearest_valid_values({path: (start, 0)}, self._check_values)[path]
             (is_valid,) = self._check_values([(path, end)])
             if is_valid:
                 values = np.broadcast_to(np.array(end, leaf.info.dtype), (1, *leaf.shape))
@@ -229,7 +243,7 @@ def _return_next(values: Iterator[Any], _: random.Random) -> Any:
     return next(values)
 
 
-def find_ends(
+def find_nearest_valid_values(
     wanted: Mapping[str, tuple[int, int]],
     are_valid: Callable[[Sequence[tuple[str, int]]], Sequence[bool]],
 ) -> dict[str, int]:
@@ -275,7 +289,9 @@ SINGLE_WALKS = 10
 def find_ranges(
     sensor: Sensor, frame: str, header: tuple[tuple[str, int], ...]
 ) -> LayoutRanges | None:
-    """Return the ranges of frames with a header; None if no valid frame is found.
+    """Return the ranges of the fields in frames with these header values.
+
+    Returns None if no valid frame with these values is found.
 
     Args:
         frame: a frame type that is compiled and has no parts.
@@ -359,10 +375,11 @@ def find_valid_frames(sensor: Sensor, frame: str) -> list[bytes]:
 @functools.lru_cache(maxsize=1024)
 def is_often_valid(sensor: Sensor, frame: str) -> bool:
     """Return whether random values often make a valid frame of a type."""
-    return any(_is_walk_valid(sensor, frame, seed) for seed in range(SINGLE_WALKS))
+    return any(_is_random_frame_valid(sensor, frame, seed) for seed in range(SINGLE_WALKS))
 
 
-def _is_walk_valid(sensor: Sensor, frame: str, seed: int) -> bool:
+def _is_random_frame_valid(sensor: Sensor, frame: str, seed: int) -> bool:
+    """Return whether one frame of random values is valid."""
     try:
         draw_frame(sensor, frame, random.Random(seed), {}, tries=1)
     except SpecError:
@@ -400,8 +417,8 @@ def find_value_ranges(sensor: Sensor, frame: str) -> Mapping[str, tuple[int, int
 
     lowest = {path: (raw, info.limits[0]) for path, (info, raw) in bounded.items()}
     highest = {path: (raw, info.limits[1]) for path, (info, raw) in bounded.items()}
-    low = find_ends(lowest, are_valid)
-    high = find_ends(highest, are_valid)
+    low = find_nearest_valid_values(lowest, are_valid)
+    high = find_nearest_valid_values(highest, are_valid)
     return {path: (low[path], high[path]) for path in bounded if low[path] < high[path]}
 
 

@@ -234,8 +234,7 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
     require(
         not len(ranges) or ranges.max() <= far * (1 + POINT_TOLERANCE),
         "LS713",
-        f"{ranges.max(initial=0):.4g} m is the largest range in the vectors, but range_limits end"
-        f" at {far:g} m",
+        f"range_limits end at {far:g} m, but a vector has a point at {ranges.max(initial=0):.4g} m",
         name,
     )
     require(
@@ -244,7 +243,7 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
         f"all points of the vectors are in {number}",
         f"{name}.points",
     )
-    subject.placed.add(name)
+    subject.frames_with_two_quadrants.add(name)
 
 
 def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
@@ -414,7 +413,12 @@ def _check_entry(subject: SensorUnderTest, vector: Any, entry_key: str) -> bool:
     Raises:
         ViolationError: if the entry is invalid.
     """
-    require(isinstance(vector, dict), "LS702", "not an object", entry_key)
+    require(
+        isinstance(vector, dict),
+        "LS702",
+        f"expected a JSON object with a frame, got {shown(vector)}",
+        entry_key,
+    )
     unknown = sorted(vector.keys() - KEYS.keys())
     require(not unknown, "LS702", f"unknown keys {unknown}; expected {sorted(KEYS)}", entry_key)
     for key, value in vector.items():

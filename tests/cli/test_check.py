@@ -71,7 +71,7 @@ def test_measured_values_are_listed_beside_references() -> None:
         "  data: range: the field can represent 0.001 .. 65.535 m; range_limits are 0.03 .. 25 m",
         lines[3],
         "  data: sense: clockwise as start_angle grows, seen from above",
-        "  data: step: 0.166 deg clockwise from point to point along the sweep",
+        "  data: step: 0.166 deg clockwise from one simulated point to the next",
         "  data: vectors: ranges 0.192 .. 2 m in 2 vectors; the points are in 3 quadrants",
         "  vendor_axes: x, y, z are forward, right, up",
         "  source: STL-27L development manual, sections 1 to 4",

@@ -141,7 +141,7 @@ def test_vectors_in_two_quadrants_prove_the_sense_of_the_points() -> None:
     subject = SensorUnderTest(sound.sensor(vendor_axes=("forward", "right", "up")))
     (held,) = [one for one in PROPERTIES if one.function is the_points_turn_as_the_axes_do]
     assert [finding.code for finding in held.findings(subject)] == ["LS511"]
-    subject.placed.add("data")
+    subject.frames_with_two_quadrants.add("data")
     assert held.findings(subject) == []
     assert "data: sense" in subject.picture
 
