@@ -49,7 +49,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.base import find_data_link
-from lidarspec.transports.open_url import live_address, resolve
+from lidarspec.transports.open_url import live_address, resolve_device_name
 from lidarspec.transports.ports import PortUser, SerialPort, find_udp_users, list_serial_ports
 from lidarspec.transports.protocol import no_bytes_message
 
@@ -297,7 +297,7 @@ def detect(
     if source is None:
         found_verdicts = list(_detect_all_ports(duration, start=start))
     else:
-        source = resolve(source)
+        source = resolve_device_name(source)
         with Progress() as progress:
             found_verdicts = _detect_source(
                 source,

@@ -44,7 +44,7 @@ from lidarspec.plugins import sensors
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Times, iter_received
 from lidarspec.sensor_operations import Sensor
-from lidarspec.transports.hex_text import hex_chunks, is_hexadecimal, parse_hex
+from lidarspec.transports.hex_text import is_hexadecimal, iter_hex_chunks, parse_hex
 from lidarspec.transports.protocol import Chunk, no_bytes_message
 
 if TYPE_CHECKING:
@@ -162,7 +162,7 @@ def _iter_standard_input(file: FileTransport) -> Iterator[Chunk]:
             return line
         return line + stdin.readline(size - len(line))
 
-    yield from hex_chunks("standard input", readline)
+    yield from iter_hex_chunks("standard input", readline)
 
 
 def read(words: Sequence[str]) -> SampleBytes:

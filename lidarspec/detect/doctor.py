@@ -34,7 +34,7 @@ from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports import ports
 from lidarspec.transports.addresses import SourceAddress, with_option
 from lidarspec.transports.base import find_data_link
-from lidarspec.transports.open_url import live_address, resolve
+from lidarspec.transports.open_url import live_address, resolve_device_name
 from lidarspec.transports.protocol import no_bytes_message
 from lidarspec.transports.udp import (
     REQUESTED_BUFFER_BYTES,
@@ -75,7 +75,7 @@ def examine(
         sensor: the expected sensor; None to detect it.
         seconds: the time to listen at each baud rate.
     """
-    text = resolve(source)
+    text = resolve_device_name(source)
     address = live_address(text)
     if address is None:
         yield from _examine_file(text, sensor)

@@ -57,7 +57,7 @@ from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.transports.base import find_data_link
 from lidarspec.transports.files import RecordingTransport
-from lidarspec.transports.open_url import live_address, open_transport, resolve
+from lidarspec.transports.open_url import live_address, open_transport, resolve_device_name
 from lidarspec.transports.protocol import no_bytes_message
 
 #: The relative tolerance of the clock step per packet.
@@ -643,7 +643,7 @@ def detect(source: str | Path) -> Sensor:
     declared_sensor = find_declared_sensor(source)
     if declared_sensor is not None:
         return declared_sensor
-    verdicts = identify_senders(resolve(source))
+    verdicts = identify_senders(resolve_device_name(source))
     fitting = [verdict for verdict in verdicts if verdict.scores]
     if not fitting:
         raise _make_no_sensor_error(str(source), verdicts)

@@ -39,7 +39,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Http, Link, Tcp, Udp
 from lidarspec.transports.addresses import find_own_address
 from lidarspec.transports.host_clock import HostClock
-from lidarspec.transports.open_url import control_link, has_control
+from lidarspec.transports.open_url import has_control, open_control_link
 from lidarspec.transports.protocol import Chunk, LiveTransport
 
 #: time between two decodings of the data that has arrived.
@@ -593,7 +593,7 @@ class LiveInput(DeviceInput):
         """Return the transport of a link; open it on first use."""
         if link not in self._captures:
             data = self._captures["data"].transport
-            opened = data.link(link) or control_link(
+            opened = data.link(link) or open_control_link(
                 self._source, link, self.sensor.links[link], self._find_sensor_host()
             )
             if _is_broadcast(self.sensor.links[link]):

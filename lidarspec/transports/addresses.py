@@ -126,7 +126,12 @@ def with_option(source: str | Path, name: str, value: object) -> str:
 
 
 def parse_origin(text: str) -> Origin:
-    """Return the sender that the value of `src=` names, with a numeric address.
+    """Return the sender that the option `src=` selects.
+
+    A host name is replaced by its numeric address.
+
+    Args:
+        text: the value of the option.
 
     Raises:
         UsageError: for an invalid port or an unknown host.

@@ -27,7 +27,10 @@ _Selector = getattr(selectors, "PollSelector", selectors.SelectSelector)
 
 
 class StreamTransport(LiveTransport):
-    """Base class for byte streams, which are read with short pauses.
+    """Base class of transports for byte streams.
+
+    After each read there is a short pause, in which bytes accumulate. The following read then
+    returns many bytes at once instead of single bytes.
 
     Attributes:
         disconnect_errors: the exceptions that reading raises if the device is disconnected.

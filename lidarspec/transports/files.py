@@ -33,7 +33,7 @@ from lidarspec.recording.format import MAGIC, Header, Record, Recording
 from lidarspec.remote_files import is_remote, open_stored
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.addresses import parse_origin
-from lidarspec.transports.hex_text import hex_chunks, is_hexadecimal
+from lidarspec.transports.hex_text import is_hexadecimal, iter_hex_chunks
 from lidarspec.transports.protocol import Chunk, Transport
 from lidarspec.transports.robotics_logs import BagTransport, find_log_kind
 
@@ -101,7 +101,7 @@ class RecordingTransport(Transport):
             damaged = self._recording.damaged
             self._has_skipped = False
             if record.direction == "event":
-                interrupted = self._is_interruption(record) or interrupted
+                interrupted = self._count_event(record) or interrupted
             elif record.direction == "in" and self._accepts(record):
                 yield Chunk(
                     record.data,
@@ -134,14 +134,17 @@ class RecordingTransport(Transport):
         self._recording.close()
 
     def _accepts(self, record: Record) -> bool:
-        """Return whether a record is from the requested sender; otherwise add 1 to `foreign`."""
+        """Return whether a record is from the requested sender.
+
+        Records from other senders are counted in `foreign`.
+        """
         if self._origin is None or record.sender in self._origin:
             return True
         self.foreign += 1
         return False
 
-    def _is_interruption(self, record: Record) -> bool:
-        """Count an event, and return whether it interrupts the stream."""
+    def _count_event(self, record: Record) -> bool:
+        """Count the event in a record, and return whether the event interrupts the stream."""
         try:
             event = json.loads(record.data)
             name = event["event"]
@@ -262,7 +265,7 @@ class HexTransport(FileTransport):
     """Reads hexadecimal text, which may also contain times."""
 
     def chunks(self) -> Iterator[Chunk]:
-        yield from hex_chunks(self._path, self.file.readline)
+        yield from iter_hex_chunks(self._path, self.file.readline)
         _check_end(self, self.file)
 
 

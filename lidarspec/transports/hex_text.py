@@ -237,7 +237,10 @@ class HexText:
 
 
 def _split_time(text: str) -> tuple[int | None, str]:
-    """Return the time at the start of a line, ns or None, and the rest of the line."""
+    """Return the time at the start of a line in ns, and the rest of the line.
+
+    The time is None if the line does not begin with a valid time.
+    """
     if match := _SECONDS.match(text):
         return _to_ns(match["at"]), text[match.end() :]
     match = _CLOCK.match(text)
@@ -333,7 +336,7 @@ def _parse_word(word: str) -> bytes:
     return bytes.fromhex(digits)
 
 
-def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
+def iter_hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
     """Yield the bytes of hexadecimal text, one chunk for each line.
 
     A line that is longer than `BLOCK_BYTES` is returned in several chunks.
@@ -370,7 +373,10 @@ def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
 
 
 def find_cut(text: str) -> int:
-    """Return an index at which hexadecimal text can be split."""
+    """Return the last index at which hexadecimal text can be split between two words.
+
+    If the text is a single word, the result is the last index that does not split a byte.
+    """
     return (
         max(
             *(text.rfind(mark) + 1 for mark in " \t\n,;:{}"), *(text.rfind(mark) for mark in "\\/#")

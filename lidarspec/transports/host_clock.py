@@ -59,7 +59,12 @@ class HostClock:
         return closest[1:]
 
     def find_step(self) -> int | None:
-        """Return wall clock minus this clock, ns; None if the difference is unchanged."""
+        """Return how far the wall clock is ahead of this clock in ns, if it was set.
+
+        Returns None if the wall clock was not set since the last step that was returned, or since
+        the start. Also returns None if the thread was suspended while the clocks were read; a later
+        call then returns the step.
+        """
         offset_ns, read_time_ns = self._read_offset()
         lead_ns = offset_ns - self._offset_ns
         if abs(lead_ns - self._lead_ns) <= _SET_CLOCK_NS or read_time_ns > _MAX_READ_TIME_NS:

@@ -47,7 +47,7 @@ def open_transport(source: str | Path, sensor: Sensor | None = None) -> Transpor
         SourceError: if the source cannot be opened.
         SpecError: if a plugin returns an object that is not a `Transport`.
     """
-    text = resolve(source)
+    text = resolve_device_name(source)
     address = live_address(text)
     if address is not None:
         return _open(address, sensor)
@@ -82,7 +82,7 @@ def open_live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport
     raise UsageError(f"{source} is a file, so nothing can be sent to it")
 
 
-def resolve(source: str | Path) -> str:
+def resolve_device_name(source: str | Path) -> str:
     """Return the SOURCE of a device in `lidarspec.toml`; any other text unchanged."""
     device = find_device(source)
     if device is None:
@@ -92,7 +92,7 @@ def resolve(source: str | Path) -> str:
 
 def is_live(source: str | Path) -> bool:
     """Return whether a SOURCE, or a device of `lidarspec.toml`, is live; False for a file."""
-    return live_address(resolve(source)) is not None
+    return live_address(resolve_device_name(source)) is not None
 
 
 def live_address(source: str | Path) -> SourceAddress | None:
@@ -122,7 +122,7 @@ def has_control(source: str | Path) -> bool:
     return address is not None and bool(address.options.get("control"))
 
 
-def control_link(source: str | Path, name: str, link: Link, host: str | None) -> LiveTransport:
+def open_control_link(source: str | Path, name: str, link: Link, host: str | None) -> LiveTransport:
     """Open the transport of a link that carries commands, but no data.
 
     Args:

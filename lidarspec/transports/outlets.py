@@ -116,12 +116,13 @@ class OutletLine:
         """
 
     def await_listener(self) -> bool:
-        """Wait until a program listens, so that it receives all bytes.
+        """Wait until a program listens, so that this program receives all bytes.
 
         For links without connections, such as UDP, this returns at once.
 
         Returns:
-            Whether the program that listened before has closed the port.
+            True if a program was listening when the method was called, and has closed the port
+            during the wait. The user is then informed that the reader has left.
         """
         return False
 
@@ -179,7 +180,8 @@ class UdpLine(OutletLine):
     """Sends UDP datagrams to a host, or to the sender of the last command.
 
     Attributes:
-        waits_for_address: whether datagrams are dropped until a command contains their destination.
+        waits_for_address: whether the destination port is unknown at first. Datagrams are dropped
+            until a command gives the port, by its content or by its sender.
     """
 
     takes_commands = False
@@ -253,7 +255,7 @@ class UdpLine(OutletLine):
     def make_reply_line(cls, host: str, port: int) -> UdpLine:
         """Return a line that replies to the sender of the last command.
 
-        The line also receives broadcasts of this computer.
+        The line also receives commands that programs on this computer broadcast.
 
         Args:
             port: the port to listen on; 0 selects any free port.
@@ -346,7 +348,9 @@ class UdpLine(OutletLine):
         return False
 
     def _may_succeed_later(self, error: OSError) -> bool:
-        """Return whether sending may succeed later, after any necessary pause.
+        """Return whether to try to send a datagram again.
+
+        If a buffer is full, the method waits before it returns.
 
         Raises:
             SourceError: if sending fails, and the user has named the receiver.
@@ -373,7 +377,8 @@ class TcpLine(OutletLine):
     Args:
         port: the port to listen on; 0 selects any free port.
         sole: whether only one connection at a time is accepted.
-        is_reported: whether the sensor reports its port, so that the SOURCE contains none.
+        is_reported: whether the sensor reports `port` to the host, so that the SOURCE contains no
+            port.
 
     Raises:
         SourceError: if the address is not available.
@@ -497,7 +502,8 @@ class PtyLine(OutletLine):
     Bytes that are sent before a program opens the terminal are lost.
 
     Args:
-        link: path of a symbolic link to the terminal, which is created and removed with it.
+        link: path of a symbolic link to the terminal. The link is created and removed together with
+            the terminal.
 
     Attributes:
         path: the path of the terminal; it changes with each `plug`.
@@ -668,7 +674,8 @@ class Outlet:
     """The lines of one sensor.
 
     Args:
-        controls: name of each other link -> its line.
+        data: the line of the data link.
+        controls: name of each link except the data link -> its line.
     """
 
     def __init__(self, data: OutletLine, controls: Mapping[str, OutletLine] | None = None) -> None:
@@ -750,7 +757,7 @@ class Outlet:
 
 
 def wait_for(lines: Collection[OutletLine], timeout: float) -> None:
-    """Wait at most `timeout` seconds for input, or until waiting bytes can be sent."""
+    """Wait until a line has input or can send its waiting bytes, at most `timeout` seconds."""
     timeout = min([timeout, *(line.max_wait_s for line in lines)])
     reading = [descriptor for line in lines for descriptor in line.readable()]
     writing = [descriptor for line in lines for descriptor in line.writable()]
