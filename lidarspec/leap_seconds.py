@@ -59,7 +59,7 @@ class LeapSeconds:
         """Return GPS time minus UTC in seconds at a UTC time (seconds since 1970)."""
         return self.tai_minus_utc(utc_s) - TAI_MINUS_GPS_S
 
-    def scale_offsets(self, utc_s: float) -> dict[str, int]:
+    def offsets_by_scale(self, utc_s: float) -> dict[str, int]:
         """Return the offsets of "utc", "tai" and "gps" from UTC in seconds, by name.
 
         Args:
@@ -74,7 +74,7 @@ class LeapSeconds:
     def utc_from_tai(self, tai_s: ArrayLike) -> NDArray[Any]:
         """Return the UTC of times in TAI; both are seconds since 1970.
 
-        A leap second repeats the second before it.
+        UTC has no number for a leap second. A time within it gets the UTC of one second earlier.
 
         Args:
             tai_s: the times, of any shape.

@@ -17,7 +17,7 @@ sensor's clock and an index from its counter. Modules in reading order:
 * `stream`: makes packets from frames, batch by batch.
 * `clock_status`: the state of the sensor's clock at each packet.
 * `clock_estimate`: the offset and the drift between the clocks of sensor and host.
-* `clock_findings`: the faults of a clock: a code for each, its text and the next step.
+* `clock_findings`: the kinds of clock faults, each with a code, a text and advice.
 * `clock_monitor`: finds the epoch, offset, drift and faults of a clock.
 * `utc_times`: the times of packets in UTC.
 """

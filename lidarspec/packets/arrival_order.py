@@ -27,7 +27,7 @@ class ArrivalOrder:
     Args:
         stats: counts the lost packets.
         clock: the clock of the packets; None to find losses by skipped bytes alone.
-        grain_ns: the resolution of the clock in ns; 0 if it is fine or unknown.
+        grain_ns: the resolution of the clock in ns; 0 if it is unknown.
     """
 
     def __init__(self, stats: Counters, clock: Clock | None, grain_ns: float) -> None:
@@ -41,8 +41,9 @@ class ArrivalOrder:
     def push(
         self, batch: Batch, times: Times | None, skipped: NDArray[np.int64]
     ) -> tuple[Index, NDArray[np.bool_]]:
-        """Return the index of each packet, (n,), and the breaks before packets, (n,).
+        """Return the index of each packet, and whether the stream breaks before the packet.
 
+        Both have the shape (n,). The stream breaks where packets were lost or the clock was set.
         The index has gaps for lost packets.
 
         Args:

@@ -62,7 +62,7 @@ class ClockLine(NamedTuple):
     """The shortest delay of packets as a linear function of the sensor's time.
 
     Attributes:
-        device: any time by the sensor's clock, ns.
+        device: the time by the sensor's clock at which `delay` applies, ns.
         delay: the shortest delay at this time, ns.
         slope: the change of the delay divided by the change of the sensor's time.
     """
@@ -94,7 +94,7 @@ class DeviceClock:
     All results are late by the shortest time that a packet needs to reach the host.
 
     Args:
-        parts: the duration to which the line is fitted, in quarters of a second.
+        parts: the number of quarters of a second, up to the newest, to which the line is fitted.
 
     Attributes:
         jumps: how often the sensor's clock was set.
@@ -226,8 +226,11 @@ class DeviceClock:
         return stamps
 
     def _find_slewed_delay(self, device: int) -> int:
-        """Return the delay to add to a time of the sensor to get its stamp, ns."""
-        # If the line changes, stamps approach it smoothly.
+        """Return the delay that is added to a time of the sensor to get a stamp, ns.
+
+        If the line changes, the delay approaches the new line gradually, so that stamps do not
+        jump.
+        """
         if self._last_stamped is None:
             return self._line.delay_at(device)
         step = device - self._last_stamped.device
@@ -366,7 +369,13 @@ def lower_hull(samples: Sequence[ClockSample]) -> list[int]:
 
 
 def slope_at(index: float, samples: Sequence[ClockSample], hull: Sequence[int]) -> float:
-    """Return the slope of the hull's edge at an index, which may be a fraction."""
+    """Return the slope of the hull's edge at a position in `samples`.
+
+    Args:
+        index: the position, which may be between two samples, such as 2.5.
+        samples: the samples in order.
+        hull: the indices of the samples on the hull.
+    """
     end = min(max(bisect_left(hull, index), 1), len(hull) - 1)
     left, low = samples[hull[end - 1]]
     right, high = samples[hull[end]]

@@ -42,14 +42,17 @@ FINDING_TYPES = MappingProxyType(
             "pass -O epoch=gps, or let the receiver apply the leap seconds",
         ),
         "utc": FindingType(
-            "runs on UTC, expected {epoch}", "pass -O epoch=utc, or let the grandmaster send TAI"
+            "runs on UTC, but the declared epoch is {epoch}",
+            "pass -O epoch=utc, or let the grandmaster send TAI",
         ),
         "behind_utc": FindingType(
             "{behind:.0f} s behind UTC: the sensor subtracts the TAI offset from a time that is"
             " already UTC",
             "let the grandmaster send TAI (ptpTimescale), with its currentUtcOffset",
         ),
-        "second_off": FindingType("{value:+.3f} s off: " + WRONG_SENTENCE, CHECK_NMEA),
+        "second_off": FindingType(
+            "{value:+.3f} s off the clock of this computer: " + WRONG_SENTENCE, CHECK_NMEA
+        ),
         "wrong_date": FindingType(
             "the date is {days:.0f} days off: the sensor's clock was probably never set",
             CONNECT_SOURCE,
@@ -61,10 +64,10 @@ FINDING_TYPES = MappingProxyType(
         ),
         "drift": FindingType(
             "drifts by {value:+.1f} ppm",
-            "synchronize the sensor by PTP or PPS, or repeat with --time host",
+            "synchronize the sensor by PTP or PPS, or use --time host",
         ),
         "unsynchronized": FindingType(
-            "the clock has no valid date, expected {epoch}", CONNECT_SOURCE
+            "the clock has no valid date, but the declared epoch is {epoch}", CONNECT_SOURCE
         ),
         "lock_lost": FindingType("lost its lock: {state}", CHECK_MASTER),
         "restart": FindingType(
@@ -88,7 +91,7 @@ FINDING_TYPES = MappingProxyType(
             "the source has no arrival times to compare with", is_fault=False
         ),
         "too_short": FindingType("too few packets to judge the clock", is_fault=False),
-        "ok": FindingType("in order", is_fault=False),
+        "ok": FindingType("no fault found", is_fault=False),
     }
 )
 _SEVERITY = {code: rank for rank, code in enumerate(FINDING_TYPES)}
@@ -96,11 +99,12 @@ _SEVERITY = {code: rank for rank, code in enumerate(FINDING_TYPES)}
 
 @dataclass(frozen=True)
 class ClockFinding:
-    """One finding about a clock.
+    """One finding about a clock: an event, such as a step, or a lasting condition.
 
     Attributes:
         code: a key of `FINDING_TYPES`.
-        host_ns: the arrival time of the first packet after an event, ns since 1970; 0 for a state.
+        host_ns: for an event, the arrival time of the first packet after it, ns since 1970; 0 for a
+            condition.
         value: the drift in ppm, or the offset or step in seconds; 0 if the code has no value.
         state: the meaning of the clock's status; "" if unknown.
         epoch: the declared epoch, a key of `spec.timing.EPOCHS`.

@@ -87,7 +87,8 @@ class ClockReport:
         late: the number of packets with a delay of more than 50 ms.
         jumps: how often the clock was set or restarted.
         findings: the findings, the most serious first; at least one.
-        events: the events in order of time.
+        events: the findings that are events, such as steps and restarts, the oldest first. Events
+            that are faults are also in `findings`.
     """
 
     epoch: str
@@ -306,12 +307,12 @@ class ClockMonitor:
             return (self._offset_s + HOUR_S / 2) % HOUR_S - HOUR_S / 2
         if epoch == "boot" or not self._has_date:
             return math.nan
-        return self._offset_s - self._scale_offsets.get(epoch, 0)
+        return self._offset_s - self._offsets_by_scale.get(epoch, 0)
 
     @property
-    def _scale_offsets(self) -> dict[str, int]:
+    def _offsets_by_scale(self) -> dict[str, int]:
         """The seconds by which each time scale is currently ahead of UTC."""
-        return read_leap_seconds().scale_offsets(self._host_ns / 1e9)
+        return read_leap_seconds().offsets_by_scale(self._host_ns / 1e9)
 
     def _judge(self) -> Iterator[ClockFinding]:
         """Yield one or more findings about the current state of the clock."""
@@ -344,7 +345,7 @@ class ClockMonitor:
         error_s = self._find_error_s()
         if math.isnan(error_s) or abs(error_s) < OFFSET_LIMIT_S:
             return None
-        scales = self._scale_offsets
+        scales = self._offsets_by_scale
         ahead_s = error_s + scales.get(epoch, 0)
         for scale, seconds in scales.items():
             if scale != epoch and abs(ahead_s - seconds) < SCALE_TOLERANCE_S:

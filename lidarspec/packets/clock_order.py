@@ -76,14 +76,15 @@ class ClockOrder:
         self._neighbours = list[RecentPacket]()  # in the order of their times
         self._offset = 0  # added to a time to get an order
         self._gaps = gaps
-        # the time before the clock's last leap, ns, and the packet after it
-        self._leap: tuple[int, RecentPacket] | None = None
+        # the time before the clock's last large jump, ns, and the packet after the jump
+        self._jump: tuple[int, RecentPacket] | None = None
 
     def push(self, batch: Batch, times: Times) -> tuple[Numbers, NDArray[np.int64]]:
-        """Return the index and the order of each packet, (n,), and mark the breaks.
+        """Return the index and the order of each packet, (n,), and mark breaks.
 
         Args:
-            batch: the packets; breaks are marked in `batch.breaks`.
+            batch: the packets. `batch.breaks` is set to True for each packet before which packets
+                were lost or the clock was set.
             times: times by the sensor's clock, (n,) ns.
         """
         paces = read_paces(self._clock, batch)
@@ -165,10 +166,10 @@ class ClockOrder:
             return self._restart(batch, row, time, checksum)
         newest = self._neighbours[-1]
         passed = time - newest.time
-        if self._leap is not None and self._leaps_back(time, passed, pace):
-            self._stats.lost -= self._leap[1].missing  # one reading was damaged
+        if self._jump is not None and self._undoes_jump(time, passed, pace):
+            self._stats.lost -= self._jump[1].missing  # one reading was damaged
             return self._restart(batch, row, time, checksum)
-        if passed > MAX_STEP_NS or self._is_too_early(time, passed, pace):
+        if passed > MAX_STEP_NS or self._is_too_far_back(time, passed, pace):
             return self._restart(batch, row, time, checksum)
         start = bisect_left(self._neighbours, time, key=_time_of)
         stop = bisect_right(self._neighbours, time, key=_time_of)
@@ -192,9 +193,9 @@ class ClockOrder:
         )
         self._neighbours.append(self._newest)
         if missing > MAX_PLACES_LATE:
-            self._leap = (newest.time, self._newest)
+            self._jump = (newest.time, self._newest)
         else:
-            self._leap = None
+            self._jump = None
         if missing and self._gaps is not None:
             self._stats.lost -= self._gaps.revoke_losses(row, newest.angle, angle, self._newest)
         return self._newest
@@ -209,14 +210,14 @@ class ClockOrder:
         """The maximum number of places by which a packet can be late."""
         return MAX_PLACES_LATE + (0 if self._gaps is None else self._gaps.masked)
 
-    def _leaps_back(self, time: int, passed: int, pace: float) -> bool:
-        """Return whether the clock has returned to its value before the last leap."""
-        assert self._leap is not None
+    def _undoes_jump(self, time: int, passed: int, pace: float) -> bool:
+        """Return whether the clock continues from its time before the last large jump."""
+        assert self._jump is not None
         reach = self._max_places_late * pace
-        return abs(passed) > reach and 0 < time - self._leap[0] <= reach
+        return abs(passed) > reach and 0 < time - self._jump[0] <= reach
 
-    def _is_too_early(self, time: int, passed: int, pace: float) -> bool:
-        """Return whether the clock goes back too far for a late packet."""
+    def _is_too_far_back(self, time: int, passed: int, pace: float) -> bool:
+        """Return whether a time is too far back to be that of a late packet."""
         if pace > 0:
             return passed < -self._max_places_late * pace
         is_full = len(self._neighbours) >= MAX_PLACES_LATE
@@ -236,9 +237,9 @@ class ClockOrder:
             time, time + self._offset, index, 0, checksum, self._get_angle(row)
         )
         if before is None:
-            self._leap = None
+            self._jump = None
         else:
-            self._leap = (before.time, self._newest)
+            self._jump = (before.time, self._newest)
         self._neighbours = [self._newest]
         return self._newest
 

@@ -1,4 +1,4 @@
-"""Read the sensor's clock as integer nanoseconds, unwrap it, and date it."""
+"""Read the sensor's clock as integer nanoseconds, unwrap it, and add its date."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ def clock_ns(sensor: SensorDescription, batch: Batch) -> Times:
     which, readings = read_clock(sensor, batch)
     if which is None:
         return readings
-    return hold_values(which, readings, np.zeros(len(batch), np.int64))
+    return hold_times(which, readings, np.zeros(len(batch), np.int64))
 
 
 def read_clock(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
@@ -224,8 +224,8 @@ def read_clock(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp
     return rows, readings[rows]
 
 
-def hold_values(which: NDArray[np.intp], times: Times, before: Times) -> Times:
-    """Return the times of packets, (n,); the previous time if a packet has none.
+def hold_times(which: NDArray[np.intp], times: Times, before: Times) -> Times:
+    """Return a time for each packet, (n,): its own, or else that of the packet before.
 
     Args:
         which: the rows of the packets that have a time, ascending, (k,).
@@ -263,7 +263,10 @@ def _sum_fields(fields: tuple[str, ...], table: Table, sensor: str) -> Times:
 
 @lru_cache(maxsize=256)
 def clock_parts(fields: tuple[str, ...], schema: Schema) -> tuple[str, str] | None:
-    """Return the axis and the kind of the parts that contain a clock, or None."""
+    """Return the path and the kind of the parts (`lidarspec.spec.Parts`) with a clock.
+
+    Returns None if the clock is not in parts, or is in parts of several kinds.
+    """
     places = set[tuple[str, str]]()
     for path in fields:
         if path in schema.fields:

@@ -52,7 +52,8 @@ class CounterReadings:
         numbers: the values of the counter, (n,).
         periods: the number of values before the counter wraps: an int for all packets, or (n,).
         has_counter: whether each packet has the counter, (n,); None if all packets have it.
-        times: the times by the sensor's clock, (n,) ns; None without a clock with a declared pace.
+        times: the times by the sensor's clock, (n,) ns; None if there is no clock, or if the
+            pace of the clock is not declared.
         steps: the time since the previous packet, (n,) ns; None if `times` is None.
         paces: the time from each packet to the next, (n,) ns; nan if unknown.
     """
@@ -137,12 +138,13 @@ class CounterOrder:
         self._jump: CounterJump | None = None  # before the newest packet
 
     def push(self, batch: Batch, times: Times | None) -> tuple[Index, NDArray[np.bool_]]:
-        """Return the index of each packet, (n,), and the breaks before packets, (n,).
+        """Return the index of each packet, and whether the stream breaks before the packet.
 
+        Both have the shape (n,). The stream breaks where packets were lost or the sensor restarted.
         The index has gaps for lost packets.
 
         Args:
-            batch: the packets. The breaks in `batch.breaks` are returned as well.
+            batch: the packets. Breaks that `batch.breaks` contains already are returned as well.
             times: times by the sensor's clock, (n,) ns; None without a clock.
 
         Raises:
@@ -156,7 +158,7 @@ class CounterOrder:
     def _place_all(
         self, batch: Batch, times: Times | None
     ) -> tuple[NDArray[np.int64] | range, NDArray[np.bool_]]:
-        """Return the index of each packet in the stream, and the breaks before packets."""
+        """Return the same as `push`, without counting the returns of firings."""
         count = len(batch)
         readings = self._read_batch(batch, times)
         self._gaps.read(batch.table)
@@ -256,8 +258,13 @@ class CounterOrder:
     def _count_places_ahead(
         self, readings: CounterReadings, row: int
     ) -> tuple[int | None, int | None]:
-        """Return how many places a packet is ahead of the newest, and its counter value."""
-        # The number of places is None if the sensor has restarted.
+        """Compare a packet with the newest packet.
+
+        Returns:
+            The index of the packet minus the newest index, or None if the sensor has restarted; and
+            the counter of the packet, corrected if the clock shows that it is corrupt. If the
+            packet has no counter, the results are 1 and the counter of the newest packet.
+        """
         number = readings.number(row)
         if number is None:
             return 1, self._number

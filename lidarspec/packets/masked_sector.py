@@ -88,7 +88,14 @@ class Sector:
 
 
 def forward_step(step: float, direction: int) -> float:
-    """Return a step in the direction of rotation, in turns from 0 to 1; 0 for jitter."""
+    """Return the angle of a step in the direction of rotation, in turns from 0 to 1.
+
+    A small step back is jitter of the angle, and gives 0.
+
+    Args:
+        step: the angle after the step minus the angle before it, in turns.
+        direction: 1 if angles grow as the sensor rotates, else -1.
+    """
     ahead = (direction * step) % 1
     if ahead > 1 - MAX_JITTER_TURNS:
         return 0.0
@@ -178,8 +185,8 @@ class SectorFinder:
             step: the angle from one packet to the next, in turns.
 
         Returns:
-            The earlier gaps at the same sector, numbered from the newest gap, which is 1; empty
-            without a sector.
+            How many gaps ago each earlier gap at the sector was, 1 for the previous gap; [] if the
+            gap does not recur.
         """
         gap = Sector.between(start, stop, self.direction)
         for other in reversed(self._gaps):
@@ -198,8 +205,8 @@ class SectorFinder:
         del self._gaps[:-REMEMBERED_GAPS]
         return []
 
-    def has_unseen_gaps(self, step: float) -> bool:
-        """Return whether a masked sector may explain one of the stored gaps."""
+    def may_have_masked_sector(self, step: float) -> bool:
+        """Return whether one of the stored gaps may be at a masked sector."""
         return any(self._is_unseen(gap, step) for gap in self._gaps)
 
     def _is_unseen(self, sector: Sector, step: float) -> bool:
@@ -229,7 +236,8 @@ class MaskedGaps:
     """Decides which gaps in one stream are at the masked sector, and which are losses.
 
     Attributes:
-        masked: the number of packets that the masked sector leaves out; 0 until it is known.
+        masked: the number of packets that the masked sector leaves out in each revolution; 0 until
+            the sector is found.
     """
 
     def __init__(self, sensor: SensorDescription) -> None:

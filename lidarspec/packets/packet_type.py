@@ -20,7 +20,9 @@ class PacketType:
 
     Attributes:
         codec: parses frames of the type.
-        others: the names of the other frame types that packets of this type need as their state.
+        other_types: the names of all other frame types that the sensor sends and that are not data,
+            such as a configuration. The last frame of each type before a packet is part of the
+            packet's state (`Packets.state`).
         clock: the clock of the packets; None without a clock.
         timed_sensor: the sensor, with its clock replaced by `clock`.
         loss_clock: the clock that shows losses; None if there is no such clock.
@@ -32,7 +34,7 @@ class PacketType:
     sensor: SensorDescription
     frame: str
     codec: Codec
-    others: tuple[str, ...]
+    other_types: tuple[str, ...]
     clock: Clock | None
     timed_sensor: SensorDescription
     loss_clock: Clock | None

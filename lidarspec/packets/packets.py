@@ -39,7 +39,8 @@ class Packets:
         time_ns: (n,) int64 ns by the sensor's clock, unwrapped; arrival times without a clock.
         host_ns: (n,) int64 arrival times, ns; 0 if unknown.
         breaks: (n,) bool, True if something was lost before the packet.
-        is_clocked: whether the packets are ordered by the sensor's clock, not by a counter.
+        is_ordered_by_clock: whether the packets are ordered by the sensor's clock instead of a
+            counter.
         state: for each other frame type, a table of its frames, and an array (n,) with the row of
             the last frame before each packet.
         masked: (n,) how many packets a masked sector leaves out directly before each packet; None
@@ -69,7 +70,7 @@ class Packets:
         self.frame = frame
         self.table = table
         self._order = order
-        self.is_clocked = order is not None
+        self.is_ordered_by_clock = order is not None
         self.masked = masked
         self._offset = offset
         self.time_ns = time_ns
@@ -190,11 +191,11 @@ class Packets:
         The fields of the structured array are the columns of the points, "valid", and "missing" for
         a return whose packet is lost. The shape depends on the sensor:
 
-        - The returns of a firing are in consecutive packets (`PacketCounter.returns`): (groups of
-          packets, *shape of the points of a packet, returns).
-        - A packet contains all returns of its firings, at the same places in each packet: (packets,
-          *shape of the firings of a packet, returns).
-        - For all other sensors: (firings, returns).
+        - If the returns of a firing are in consecutive packets (`PacketCounter.returns`), the shape
+          is (groups of packets, *shape of the points of a packet, returns).
+        - If a packet contains all returns of its firings, at the same places in each packet, the
+          shape is (packets, *shape of the firings of a packet, returns).
+        - For all other sensors, the shape is (firings, returns).
 
         Raises:
             SpecError: as for `points`.
@@ -252,10 +253,13 @@ class Packets:
         return {**columns, "order": order, "masked": masked}
 
     def parts(self, path: str) -> Packets:
-        """Return the parts of all packets, in stream order, as packets.
+        """Return parts of the frames as packets of their own, in stream order.
+
+        The parts are the structs in a field of type `Parts`, such as the blocks of a telegram.
 
         Args:
-            path: the path of the parts, such as "blocks", or with the kind, such as "tlvs.points".
+            path: the path of the field, such as "blocks". If the field has several kinds of parts,
+                the path ends with the name of a kind, such as "tlvs.points".
 
         Raises:
             UnknownField: if the frame does not have these parts, or if there are several kinds and
@@ -293,7 +297,7 @@ class Packets:
 
     @property
     def with_points(self) -> Packets:
-        """The packets that contain the points: these packets, or their parts."""
+        """The packets to which `points` is applied: these packets, or their parts."""
         path = self.sensor.parts_with("points", self.frame)
         if path:
             return self.parts(path)
@@ -301,7 +305,11 @@ class Packets:
 
     @property
     def frames(self) -> tuple[Table, NDArray[np.intp] | slice]:
-        """The frames that contain the packets, and the row of each packet's frame, (n,)."""
+        """The whole frames of the packets, and the row of each packet's frame, (n,).
+
+        If the packets are parts of frames, these are the outer frames. Otherwise, they are the
+        packets themselves, and a slice of all rows takes the place of the array.
+        """
         table, which = self.state.get(AROUND, (None, slice(None)))
         if table is None:
             return (self.table, slice(None))
@@ -334,7 +342,7 @@ def join_packets(parts: Sequence[Packets]) -> Packets:
     columns: dict[str, Any] = {
         key: np.concatenate([getattr(part, key) for part in parts]) for key in _COLUMNS
     }
-    if all(part.is_clocked for part in parts):
+    if all(part.is_ordered_by_clock for part in parts):
         columns["order"] = np.concatenate([part.order for part in parts])
     if any(part.masked is not None for part in parts):
         columns["masked"] = np.concatenate(
@@ -393,7 +401,7 @@ def _nested_dtype(
 
 
 def _list_forms(schema: Schema, here: str) -> set[tuple[bool, int]]:
-    """Return the forms of a path: whether it is a value, and its number of array axes."""
+    """Return the forms of a path, each as (is a value, number of array axes)."""
     # A struct with branches can have a value in one branch, and a struct in another one.
     parts = [
         (path, info)

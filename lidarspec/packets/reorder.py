@@ -4,7 +4,8 @@ If a packet is missing, the packets after it are held until it arrives, or until
 packets are held. Packets without a gap before them are released at once.
 
 `WINDOW` packets are held at the start, because the first packet to arrive may not be the first that
-was sent. They are always held if the packets are sorted by a clock without a declared pace.
+was sent. If the packets are sorted by a clock without a declared pace, gaps cannot be recognized,
+so that `WINDOW` packets are held all the time.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ class Reorder:
         self._next = packets.index.item(-1) + 1
         self._released = packets.order.item(-1)
         has_gap = len(gaps) > (before is None) or bool(packets.breaks.any())
-        if not packets.is_clocked and not has_gap:
+        if not packets.is_ordered_by_clock and not has_gap:
             return [packets]
         return [self._mark_breaks(packets, before)]
 
@@ -135,7 +136,7 @@ class Reorder:
             before: the index that follows the last released packet; None if no packet was released.
         """
         marked = copy.copy(packets)
-        if packets.is_clocked:
+        if packets.is_ordered_by_clock:
             marked.index, marked.breaks = self._find_breaks_by_clock(packets)
             return marked
         start = packets.index.item(0) if before is None else before
@@ -156,6 +157,7 @@ class Reorder:
 
 
 def _shows_gaps(packets: Packets) -> bool:
-    """Return whether a missing packet leaves a gap in the index."""
+    """Return whether losses are visible as gaps in the index of the packets."""
+    # Packets that are ordered by a clock without a declared pace have no gaps.
     clock = packets.sensor.clock
-    return not packets.is_clocked or (clock is not None and clock.pace is not None)
+    return not packets.is_ordered_by_clock or (clock is not None and clock.pace is not None)

@@ -64,8 +64,8 @@ class GroupCounter:
     """Counts the incomplete groups of packets.
 
     Args:
-        rule: the counter of the packets.
-        stats: the counters; the groups are added to `incomplete_returns`.
+        rule: the declaration of the counter that numbers the packets.
+        stats: the statistics; the incomplete groups are added to `incomplete_returns`.
     """
 
     def __init__(self, rule: PacketCounter, stats: Counters) -> None:
@@ -142,7 +142,7 @@ def arrange_returns(packets: PacketBatch, index: NDArray[np.int64]) -> NDArray[A
         if cloud.return_index is not None:
             numbers = cloud.return_index.reshape(len(packets), -1)
             members = _place_by_return_index(members, numbers)
-        indices = _join_packets(members, shape)
+        indices = _index_points_by_group(members, shape)
     elif is_regular and cloud.return_index is not None:
         indices = _split_axis(cloud.return_index.reshape(len(packets), *shape))
     if indices is None:
@@ -175,11 +175,13 @@ def _place_by_return_index(
     return groups, np.where(is_kept, places, own), sizes
 
 
-def _join_packets(
+def _index_points_by_group(
     members: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
     shape: tuple[int, ...],
 ) -> NDArray[np.intp]:
-    """Return the indices of points in groups of packets, (groups, *shape, returns).
+    """Return the index of each point, arranged by groups: (groups, *shape, returns).
+
+    An index counts the points of all packets; `MISSING` stands for a lost packet.
 
     Args:
         members: for each packet, its group, its position in the group, and the size of the group,

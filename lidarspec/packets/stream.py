@@ -26,7 +26,7 @@ from lidarspec.packets.clocks import (
     ClockEpoch,
     ClockReference,
     Unwrapper,
-    hold_values,
+    hold_times,
     read_clock,
 )
 from lidarspec.packets.counter_order import CounterOrder
@@ -70,7 +70,7 @@ class PacketStream:
         self.stats = stats
         self._backend = backend
         self._last_frames: dict[str, Table] = {}  # last frame of each other type, by name
-        for name in self._type.others:
+        for name in self._type.other_types:
             if state and name in state:
                 self._last_frames[name] = get_codec(sensor.frames[name]).table([state[name]])
         self._skipped = 0  # bytes since the last packet
@@ -106,7 +106,7 @@ class PacketStream:
             columns = self._make_empty_columns()
         table = columns.table
         state: dict[str, StateOf] = {}
-        if self._type.others:
+        if self._type.other_types:
             state = self._find_states(parts, len(table), whole=whole)
         host = _to_host_times(columns.at)
         breaks = np.zeros(len(table), np.bool_)
@@ -201,7 +201,7 @@ class PacketStream:
             before = repeat(self._time, len(host))
         if len(times):
             self._time = times.item(-1)
-        return hold_values(which, times, before)
+        return hold_times(which, times, before)
 
     def _date_times(self, times: Integers) -> Integers:
         """Return times in ns since 1970; unchanged if no frame has reported the date."""
@@ -249,17 +249,17 @@ class PacketStream:
     def _find_states(
         self, parts: Sequence[OwnFrames], packet_count: int, *, whole: bool
     ) -> dict[str, StateOf]:
-        """Return the frames that packets need as their state, by frame type."""
+        """Return the state of the packets: for each other frame type, its last frames."""
         others = self._select_others(parts)
         return {
             name: self._find_state(
                 name, others.get(name, []), packet_count=packet_count, whole=whole
             )
-            for name in self._type.others
+            for name in self._type.other_types
         }
 
     def _select_others(self, parts: Sequence[OwnFrames]) -> dict[str, list[OtherFrames]]:
-        """Return the new frames that packets need as their state, by frame type."""
+        """Return the new frames of the other types in the state, by frame type."""
         selected: dict[str, list[OtherFrames]] = {}
         packet_count = 0
         for part in parts:
@@ -271,7 +271,7 @@ class PacketStream:
                 before = packet_count + others - np.arange(len(others))
                 for kind in np.unique(kinds).tolist():
                     name = part.piece.names[kind]
-                    if name in self._type.others:
+                    if name in self._type.other_types:
                         which = kinds == kind
                         frames = part.piece.select(others[which])
                         selected.setdefault(name, []).append((frames, before[which]))
@@ -378,7 +378,7 @@ def read_imu(packets: Packets) -> ImuSamples:
 
 @dataclass(frozen=True, eq=False)
 class OwnFrames:
-    """The frames of one type in a piece of input.
+    """The frames of the stream's own type in a piece of input.
 
     Attributes:
         frames: the frames of the type.

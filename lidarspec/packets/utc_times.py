@@ -67,7 +67,7 @@ class UtcSource:
         if self.kind == "arrival":
             text = f"the arrival times, because {self.reason}"
         elif self.kind == "hour":
-            text = "the sensor's clock within the hour; the hour comes from the arrival time"
+            text = "the sensor's clock; the date and the hour come from the arrival time"
         elif self.epoch == "utc":
             text = "the sensor's clock"
         else:
@@ -245,7 +245,10 @@ class UtcTimes:
     def _explain_unknown(self, source: UtcSource) -> UsageError:
         """Return the error for times that cannot be converted."""
         error = UsageError(
-            f"UTC is unknown, because {self._name} has no arrival times, and"
-            f" {source.reason}: record with arrival times (lidarspec record -o drive.lsr)"
+            f"UTC is unknown, because {self._name} has no arrival times, and {source.reason}"
         )
-        return suggest(error, "repeat with --time sensor")
+        return suggest(
+            error,
+            "repeat with --time sensor to keep the sensor's own times, or record with arrival"
+            " times: lidarspec record -o drive.lsr",
+        )

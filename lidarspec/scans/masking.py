@@ -159,7 +159,7 @@ class Masking:
             if steps[row] > limits[row]:
                 start = before if row == 0 else angles[row - 1]
                 self._finder.add_gap(float(start), float(angles[row]), step)
-            is_turn_without_leap = row in turns and not self._finder.has_unseen_gaps(step)
+            is_turn_without_leap = row in turns and not self._finder.may_have_masked_sector(step)
             if self._finder.sector is not None or is_turn_without_leap or turned[row] > MAX_TURNS:
                 self._is_settled = True
                 break

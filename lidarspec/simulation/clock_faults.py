@@ -220,5 +220,5 @@ class ClockTimeline:
 
     def _scale_offset_ns(self) -> int:
         """Return the offset from UTC of the time scale that the clock follows, ns."""
-        offsets_s = read_leap_seconds().scale_offsets(self._power_on_ns / SECOND_NS)
+        offsets_s = read_leap_seconds().offsets_by_scale(self._power_on_ns / SECOND_NS)
         return offsets_s[self.faults.follows] * SECOND_NS

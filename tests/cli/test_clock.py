@@ -83,7 +83,7 @@ def test_a_live_source_ends_beside_a_file(tmp_path: Path, monkeypatch: pytest.Mo
 def test_stats_and_doctor_report_the_clock(tmp_path: Path) -> None:
     path = record(tmp_path / "drive.lsr", ahead_ns=0)
     stats = ran("stats", path)
-    assert "runs on UTC, expected TAI" in stats.stdout
+    assert "runs on UTC, but the declared epoch is TAI" in stats.stdout
     summary = json.loads(ran("stats", path, "--json").stdout.splitlines()[-1])
     assert summary["clock"]["findings"][0]["code"] == "utc"
     diagnoses = json.loads(ran("doctor", path, "--json", code=1).stdout)

@@ -221,7 +221,7 @@ def test_a_clock_without_its_date_is_described_as_such() -> None:
         rows["offset"]
         == "-840000000.000 s from the host's clock; the sensor's clock has no valid date"
     )
-    assert rows["verdict"] == "the clock has no valid date, expected UTC"
+    assert rows["verdict"] == "the clock has no valid date, but the declared epoch is UTC"
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ def test_a_type_is_worked_out_once_and_pickled_by_its_name() -> None:
     assert get_packet_type(sensor, "data") is found
     again = pickle.loads(pickle.dumps(found))
     assert (again.sensor.id, again.frame) == (sensor.id, "data")
-    assert "position" in again.others
+    assert "position" in again.other_types
 
 
 def test_an_unknown_type_is_an_error() -> None:
