@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import plugin_errors
 from lidarspec.expressions.columns import Batch, Fields, align_points, make_value_mask
 from lidarspec.points.conventions import vendor_turn
-from lidarspec.points.reference_evaluator import flatten_valid
+from lidarspec.points.reference_evaluator import flatten_points
 from lidarspec.spec.results import Imu
 from lidarspec.spec.sensor import SensorDescription
 
@@ -115,10 +115,10 @@ def read_samples(
         mask = make_value_mask(array_axes, shape, batch)
         offsets_ns = np.rint(np.nan_to_num(np.asarray(offsets_s, np.float64)) * 1e9)
         packet_ns = time_ns.reshape(-1, *[1] * len(array_axes))  # as many axes as the arrays
-        sample_ns = flatten_valid(packet_ns + offsets_ns.astype(np.int64), shape, mask, len(batch))
+        sample_ns = flatten_points(packet_ns + offsets_ns.astype(np.int64), shape, mask, len(batch))
         values = np.stack(
             [
-                np.asarray(flatten_valid(component, shape, mask, len(batch)), np.float64)
+                np.asarray(flatten_points(component, shape, mask, len(batch)), np.float64)
                 for component in components
             ],
             axis=1,

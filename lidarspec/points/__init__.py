@@ -2,6 +2,10 @@
 
 `Packets` are converted to a `PointCloud`, which computes each column when it is first read. Three
 evaluators give the same columns: the reference evaluator, a NumPy plan, and compiled kernels.
+
+Packets have the same *layout* if their fields are at the same offsets. A *plan* describes how the
+points of packets with one layout are computed: for each column, it has an expression of the fields.
+
 Modules in reading order:
 
 * `conventions`: the definitions of axes, ranges, coordinates and types of columns.
@@ -14,8 +18,8 @@ Modules in reading order:
 * `appearance`: the extent and the colours of a drawn cloud.
 * `reference_evaluator`: evaluates `points` with ordinary NumPy; other evaluators must agree.
 * `lookup_tables`: the value of an expression for every value of a field of one or two bytes.
-* `plan`: traces `points` once for a layout, and plans each column as an expression.
-* `layout_groups`: the packets of one layout in a batch, with their plan.
+* `plan`: traces `points` once for a layout, and makes a plan.
+* `layout_groups`: the packets of a batch that have the same layout, with their plan.
 * `batch_columns`: the columns of planned points, computed when they are first read.
 * `evaluate`: evaluates the points of a batch, by plans if `points` can be traced.
 * `numpy_plan`, `numba_kernels`: back ends, each behind one function `compile(plan, names)`.

@@ -46,13 +46,14 @@ class CloudAppearance:
     """The extent and the colours of a drawn cloud.
 
     Attributes:
-        ramp: the column that the colours show: "range", "intensity", or a column in
+        ramp: the name of the column that the colours show: "range", "intensity", or a column in
             `PointCloud.extra`.
         reach: the distance from the middle of the picture to its nearer edge, metres.
-        full: the value with the last colour, in metres for ranges, else in `unit`.
+        full: the highest value of the colour scale, which has the last colour; in metres for
+            ranges, else in `unit`.
         middle: the point in the middle of the picture, metres forward and left of the sensor.
         flat: whether all points are in the plane of the sensor.
-        low: the value with the first colour.
+        low: the lowest value of the colour scale, which has the first colour.
         unit: the unit of the values; "" for ranges and plain numbers.
     """
 
@@ -172,10 +173,10 @@ def _half_extent(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:
 
 
 def round_up(value: float, rounds: Sequence[float] = ROUND_NUMBERS) -> float:
-    """Return the next larger round number, by default 1, 1.2, 1.5, 2, 2.5 ... 10, 12.
+    """Return the smallest round number that is at least a value, within 0.1 %.
 
     Args:
-        rounds: the round numbers between 1 and 10.
+        rounds: the round numbers from 1 to 10. Their products with powers of ten are round, too.
     """
     power = 10.0 ** math.floor(math.log10(value))
     return next(
@@ -189,9 +190,10 @@ def ring_step(reach: float) -> float:
 
 
 def ramp_positions(cloud: PointCloud, look: CloudAppearance) -> NDArray[np.float64]:
-    """Return the position of each point on the colour scale, (n,), from 0.
+    """Return the position of each point on the colour scale, (n,).
 
-    The last colour is at 1. Larger values have positions above 1.
+    The first colour is at 0, and the last colour at 1. Values outside of the scale have positions
+    below 0 or above 1.
     """
     if look.ramp == "range":
         return np.hypot(cloud.x, cloud.y).astype(np.float64) / look.full

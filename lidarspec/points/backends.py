@@ -1,7 +1,7 @@
 """Choose the back end that computes columns: NumPy or compiled kernels.
 
-Loading Numba and compiling a kernel take about a second. The back end "auto" uses a kernel after
-enough points were computed to save this time.
+Loading Numba and compiling a kernel take about a second. The back end "auto" therefore begins with
+NumPy. It changes to a kernel when so many points have been computed that a kernel saves time.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _NEVER = -(1 << 62)
 _POINT_COUNTS: WeakKeyDictionary[PointsFunction, dict[tuple[str, ...], int]] = WeakKeyDictionary()
 
 
-def choose_maker(plan: Plan, names: tuple[str, ...], backend: str, frames: int) -> ColumnMaker:
-    """Return an object that computes columns of a plan.
+def compile_columns(plan: Plan, names: tuple[str, ...], backend: str, frames: int) -> ColumnMaker:
+    """Compile columns of a plan to a NumPy program or a kernel.
 
     Args:
         backend: "numpy", "jit" or "auto".
@@ -54,7 +54,7 @@ def _find_faster_kernel(plan: Plan, names: tuple[str, ...], frames: int) -> Colu
     try:
         if numba_kernels.is_available():
             kernel = numba_kernels.compile(plan, names)
-            if counts[names] < MIN_COLD_KERNEL_POINTS and not kernel.is_compiled:
+            if counts[names] < MIN_COLD_KERNEL_POINTS and not kernel.was_stored:
                 return None
             kernel.compile()
             return kernel

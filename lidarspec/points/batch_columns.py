@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lidarspec.expressions.graph import Node
 from lidarspec.frames.arrays import add_axes
-from lidarspec.points.backends import choose_maker
+from lidarspec.points.backends import compile_columns
 from lidarspec.points.column_sources import ColumnSource
 from lidarspec.points.conventions import (
     TYPES,
@@ -27,7 +27,7 @@ from lidarspec.points.conventions import (
     turn_azimuth,
     vendor_turn,
 )
-from lidarspec.points.layout_groups import GroupPoints
+from lidarspec.points.layout_groups import LayoutGroup
 from lidarspec.points.reference_evaluator import PacketBatch
 
 #: The columns that one program or kernel computes together.
@@ -61,7 +61,7 @@ class BatchColumns(ColumnSource):
     def __init__(
         self,
         packets: PacketBatch,
-        shares: Sequence[GroupPoints],
+        shares: Sequence[LayoutGroup],
         size: int,
         base: int,
         *,
@@ -145,7 +145,9 @@ class BatchColumns(ColumnSource):
                 together.
         """
         main = [name for name in names if name in self._main_columns]
-        sent = [name for name in names if all(name in share.plan.sent for share in self._shares)]
+        sent = [
+            name for name in names if all(name in share.plan.raw_fields for share in self._shares)
+        ]
         if len(sent) + len(main) == 1 or self._turn is not None:
             sent = []
         columns: dict[str, NDArray[Any]] = {}
@@ -159,17 +161,17 @@ class BatchColumns(ColumnSource):
         return columns
 
     def _compute_single(self, name: str, start: int, stop: int) -> dict[str, NDArray[Any]]:
-        """Return one column by its name; an empty dict if the sensor does not have it."""
+        """Return a dict with one column; it is empty if the sensor lacks the column."""
         if name == "z":  # of a level source; otherwise it is one of the main columns
             return {}
         if name == "time":
             first, last = self._packet_range(start, stop)
             times = [self._compute_times(share, first, last) for share in self._shares]
             return {name: self._flatten(times, np.dtype(np.float64), start, stop)}
-        if name in self._plan.expressions and name not in self._plan.sent:
+        if name in self._plan.expressions and name not in self._plan.raw_fields:
             return self._compute_compiled(name, start, stop)
         if name in self._plan.parts:
-            return {name: self._compute_plainly(name, start, stop)}
+            return {name: self._compute_by_reference(name, start, stop)}
         return {}
 
     def _compute_compiled(self, name: str, start: int, stop: int) -> dict[str, NDArray[Any]]:
@@ -185,9 +187,9 @@ class BatchColumns(ColumnSource):
                 columns["azimuth"] = narrow_angle(angles)
         return columns
 
-    def _compute_plainly(self, name: str, start: int, stop: int) -> NDArray[Any]:
+    def _compute_by_reference(self, name: str, start: int, stop: int) -> NDArray[Any]:
         first, last = self._packet_range(start, stop)
-        values = [share.compute_plainly(name, first, last) for share in self._shares]
+        values = [share.compute_by_reference(name, first, last) for share in self._shares]
         column = self._flatten(values, np.result_type(*values), start, stop)
         if name in self._plan.extra:
             return self._plan.extra[name].column(column)
@@ -201,7 +203,7 @@ class BatchColumns(ColumnSource):
         filled = []
         for share in self._shares:
             count = len(share.group.rows[first:last])
-            maker = choose_maker(share.plan, names, self._packets.backend, count)
+            maker = compile_columns(share.plan, names, self._packets.backend, count)
             filled.append(share.fill(maker, first, last))
         return {
             name: self._flatten([columns[name] for columns in filled], column.dtype, start, stop)
@@ -235,13 +237,14 @@ class BatchColumns(ColumnSource):
         return column
 
     def _compute_times(
-        self, share: GroupPoints, first: int, last: int | None
+        self, share: LayoutGroup, first: int, last: int | None
     ) -> NDArray[np.float64]:
         """Return the times of points, (packets, *shape), in seconds since `base`."""
         times = self._packets.time_ns[share.group.where[first:last]]
         offsets = seconds_since(times, self.base)
         return np.asarray(
-            share.compute_plainly("time", first, last) + add_axes(offsets, len(share.plan.shape))
+            share.compute_by_reference("time", first, last)
+            + add_axes(offsets, len(share.plan.shape))
         )
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -250,9 +253,9 @@ class BatchColumns(ColumnSource):
         share = self._shares[0]
         packets, places = np.divmod(indices, self._plan.width)
         if isinstance(self._plan.parts["time"], Node):
-            few = share.take(packets).compute_plainly("time")
+            few = share.take(packets).compute_by_reference("time")
         else:
-            few = share.compute_plainly("time")[packets]
+            few = share.compute_by_reference("time")[packets]
         offsets = seconds_since(self._packets.time_ns[packets], self.base)
         return np.asarray(few.reshape(len(packets), -1)[np.arange(len(packets)), places] + offsets)
 

@@ -106,13 +106,16 @@ class PointCloud:
         return {name: column for name, column in columns.items() if column is not None}
 
     def has_column(self, name: str) -> bool:
-        """Return whether a column is selected; always True for x, y and z."""
+        """Return whether `select_columns` has kept a column; always True for x, y and z.
+
+        If no columns were selected, the result is True for every name.
+        """
         return not self.chosen or name in (*self.chosen, "x", "y", "z")
 
     def select_columns(self, *names: str) -> PointCloud:
         """Return the same points with some of their columns.
 
-        x, y and z are kept if a file format requires them.
+        A file that requires x, y and z contains them even if they are not selected.
 
         Raises:
             UnknownName: if the cloud does not have a column.
@@ -189,7 +192,7 @@ class PointCloud:
         return PointCloud(**{**picked, "shape": shape})
 
     def organise(self, columns: int) -> PointCloud:
-        """Return the points sorted into an image by their column numbers.
+        """Return an image of a revolution: the columns of the points in order of their numbers.
 
         A missing column is filled with invalid points.
 
@@ -197,8 +200,8 @@ class PointCloud:
             columns: the number of columns of a revolution. All points must be from one revolution.
 
         Raises:
-            UsageError: if the points have no `column` or are not organised, or if a column number
-                occurs twice or is too large.
+            UsageError: if the points have no `column` or no `shape`, or if a column number occurs
+                twice or is too large.
         """
         if self.shape is None or self.column is None:
             raise UsageError("an image requires organised points with column numbers")

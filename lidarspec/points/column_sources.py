@@ -39,7 +39,8 @@ class ColumnSource:
         """Return columns of the points from `start` to `stop`, (stop - start,) each.
 
         The result may have further columns. It has no entry for columns that the sensor does not
-        have, and it may lack "valid" and "z", which follow from x.
+        have. It may lack "valid", which is True for each point whose x is not nan. If `is_level`,
+        it may lack "z" (`level_z`).
 
         Args:
             names: the names of columns of `PointCloud`, or of columns in `extra`.

@@ -98,10 +98,11 @@ def coordinates(
 
 
 def place_points(coordinates: Sequence[Any], invalid: Any) -> list[Any]:
-    """Return the x, y and z of a `Cartesian` result, metres, nan for invalid points.
+    """Return x, y and z in metres, with nan for points that are not valid.
 
     Args:
-        coordinates: x, y and z of the result; 0, 0, 0 without a return.
+        coordinates: x, y and z of a `Cartesian` that the `points` function returned; 0, 0, 0 means
+            that there is no return.
         invalid: whether the sensor marks the point as invalid.
     """
     away = sum(abs(place) for place in coordinates if not is_zero(place))
@@ -277,7 +278,10 @@ def find_axes(sensor: SensorDescription) -> tuple[str, str, str]:
 
 @lru_cache(maxsize=256)
 def vendor_turn(sensor: SensorDescription) -> NDArray[np.float64] | None:
-    """Return the (3, 3) matrix from REP-103 to the configured axes; None if equal."""
+    """Return the (3, 3) matrix from REP-103 to the axes of a sensor's points.
+
+    Returns None if the axes are those of REP-103.
+    """
     axes = find_axes(sensor)
     if axes == REP_103:
         return None

@@ -20,7 +20,7 @@ from lidarspec.frames.arrays import repeat
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows
 from lidarspec.points.batch_columns import BatchColumns
 from lidarspec.points.conventions import Grids, make_grid
-from lidarspec.points.layout_groups import GroupPoints, PlainValues
+from lidarspec.points.layout_groups import LayoutGroup, ReferenceValues
 from lidarspec.points.plan import MODERATE_SIZES, STATEFUL_KINDS, Plan, plan_for
 from lidarspec.points.reference_evaluator import (
     EvaluatedPoints,
@@ -38,26 +38,26 @@ def evaluate(
     carry: Carry | None = None,
     *,
     final: bool = True,
-    epoch: int | None = None,
+    stamp_ns: int | None = None,
 ) -> EvaluatedPoints:
     """Return the points of a batch, evaluated in the fastest possible way.
 
     Args:
         carry: the state left by the previous batch.
         final: whether no packets follow. If True, the result has the points of all packets.
-        epoch: the stamp of the cloud, int64 ns; by default the time of the first packet.
+        stamp_ns: the stamp of the cloud, int64 ns; by default the time of the first packet.
 
     Raises:
         PluginError: if the plugin's function fails or returns columns of a wrong shape.
     """
-    planned = _evaluate_by_plans(packets, carry, final=final, epoch=epoch)
+    planned = _evaluate_by_plans(packets, carry, final=final, stamp_ns=stamp_ns)
     if planned is not None:
         return planned
-    return evaluate_plainly(packets, carry, final=final, epoch=epoch)
+    return evaluate_plainly(packets, carry, final=final, stamp_ns=stamp_ns)
 
 
 def _evaluate_by_plans(
-    packets: PacketBatch, carry: Carry | None, *, final: bool, epoch: int | None
+    packets: PacketBatch, carry: Carry | None, *, final: bool, stamp_ns: int | None
 ) -> EvaluatedPoints | None:
     """Return the points of a batch, evaluated by plans; None without a valid plan."""
     table = packets.table
@@ -74,7 +74,7 @@ def _evaluate_by_plans(
             plans.append(plan)
     except Exception:
         return None  # the reference evaluator reports the error
-    whole = PlainValues(batch)
+    whole = ReferenceValues(batch)
     try:
         remembered = {
             node.number: whole.column(node)
@@ -93,8 +93,8 @@ def _evaluate_by_plans(
     ready = len(packets)
     if not final:
         ready = min((column.ready for column in remembered.values()), default=ready)
-    source = _make_source(packets, shares, batch, ready, find_stamp(packets, epoch))
-    counts = _count_points(shares, len(packets))[:ready]
+    source = _make_source(packets, shares, batch, ready, find_stamp(packets, stamp_ns))
+    counts = _mark_points(shares, len(packets))[:ready]
     return EvaluatedPoints(source, ready, counts, plans[0].axes, batch)
 
 
@@ -102,9 +102,9 @@ def _make_group(
     plan: Plan,
     batch: Batch,
     group: LayoutRows,
-    whole: PlainValues,
+    whole: ReferenceValues,
     remembered: Mapping[int, Column],
-) -> GroupPoints:
+) -> LayoutGroup:
     """Return the packets of one layout with their plan.
 
     Args:
@@ -113,13 +113,13 @@ def _make_group(
     """
     is_whole = len(group.where) == len(batch) and group.is_in_order
     if is_whole:
-        return GroupPoints(plan, group, whole, batch)
-    return GroupPoints.make(plan, batch, group, remembered)
+        return LayoutGroup(plan, group, whole, batch)
+    return LayoutGroup.make(plan, batch, group, remembered)
 
 
-def _is_valid(share: GroupPoints) -> bool:
+def _is_valid(share: LayoutGroup) -> bool:
     """Return whether the plan of a group is valid for the packets of the group."""
-    values = share.plain_values
+    values = share.reference_values
     for node, number in share.plan.tape.steps:
         if len(values.column(node).steps()) != number:
             return False
@@ -130,7 +130,7 @@ def _is_valid(share: GroupPoints) -> bool:
     return all(_is_moderate(share, node) for node in share.plan.floats)
 
 
-def _is_moderate(share: GroupPoints, node: Node) -> bool:
+def _is_moderate(share: LayoutGroup, node: Node) -> bool:
     """Return whether all numbers of a field are suitable for computation in float32."""
     leaf = share.plan.layout.leaves.get(node.path)
     if leaf is None:
@@ -155,7 +155,7 @@ def _are_moderate(values: NDArray[Any]) -> bool:
 
 
 def _make_source(
-    packets: PacketBatch, shares: list[GroupPoints], batch: Batch, ready: int, stamp_ns: int
+    packets: PacketBatch, shares: list[LayoutGroup], batch: Batch, ready: int, stamp_ns: int
 ) -> BatchColumns:
     """Return the columns of the points of the first `ready` packets."""
     plan = shares[0].plan
@@ -177,7 +177,7 @@ def _make_source(
     return BatchColumns(packets, shares, size, stamp_ns, grids=grids, nominal=nominal)
 
 
-def _count_points(shares: list[GroupPoints], number: int) -> NDArray[Any]:
+def _mark_points(shares: list[LayoutGroup], number: int) -> NDArray[Any]:
     """Return an array with 1 for each point and 0 for padding, (number, *lengths)."""
     if len(shares) == 1 or len({share.plan.shape for share in shares}) == 1:
         return repeat(1, number, *shares[0].plan.shape)
@@ -192,17 +192,17 @@ def _count_points(shares: list[GroupPoints], number: int) -> NDArray[Any]:
 
 
 def evaluate_guarded(
-    packets: PacketBatch, carry: Carry | None = None, *, final: bool, epoch: int
+    packets: PacketBatch, carry: Carry | None = None, *, final: bool, stamp_ns: int
 ) -> EvaluatedPoints | None:
     """Return the points of a batch of a stream; None if the plugin fails.
 
     Args:
         carry: the state left by the previous batch.
         final: whether no packets follow. If True, the points of all packets are returned.
-        epoch: the stamp of the cloud, int64 ns.
+        stamp_ns: the stamp of the cloud, int64 ns.
     """
     try:
-        points = evaluate(packets, carry, final=final, epoch=epoch)
+        points = evaluate(packets, carry, final=final, stamp_ns=stamp_ns)
     except SpecError as error:
         packets.stats.count_error(PluginError.of(error, f"points of {packets.frame}"), len(packets))
         return None

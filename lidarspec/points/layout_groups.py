@@ -1,4 +1,4 @@
-"""The packets of one layout in a batch, with their plan and their values."""
+"""The packets of a batch that have the same layout, with their plan and their values."""
 
 from __future__ import annotations
 
@@ -19,8 +19,11 @@ from lidarspec.points.plan import STATEFUL_KINDS, ColumnMaker, Plan
 MAX_EXACT_BYTES = 4
 
 
-class PlainValues:
-    """The values of nodes for one batch, computed once by the reference evaluator."""
+class ReferenceValues:
+    """The values of the nodes of expressions for one batch.
+
+    The reference evaluator computes each value once.
+    """
 
     def __init__(self, batch: Batch) -> None:
         self._fields = Fields(batch)
@@ -86,8 +89,8 @@ class PlainValues:
 
 
 @dataclass(eq=False)
-class GroupPoints:
-    """The packets of one layout in a batch, with their plan and their values.
+class LayoutGroup:
+    """The packets of a batch that have the same layout, with their plan and their values.
 
     Attributes:
         first: the index in the batch of the first point of each packet, (n,); -1 for a packet that
@@ -96,7 +99,7 @@ class GroupPoints:
 
     plan: Plan
     group: LayoutRows
-    plain_values: PlainValues
+    reference_values: ReferenceValues
     batch: Batch
     first: NDArray[np.intp] | None = None
 
@@ -109,7 +112,7 @@ class GroupPoints:
         columns = maker.columns(len(rows))
 
         def values(node: Node) -> NDArray[Any]:
-            array = self.plain_values.array(node)
+            array = self.reference_values.array(node)
             if len(array) > 1:
                 return array[first:stop]
             return array
@@ -117,7 +120,9 @@ class GroupPoints:
         maker.run(rows, values, columns)
         return columns
 
-    def compute_plainly(self, name: str, first: int = 0, stop: int | None = None) -> NDArray[Any]:
+    def compute_by_reference(
+        self, name: str, first: int = 0, stop: int | None = None
+    ) -> NDArray[Any]:
         """Return one part of the result of `points`, by the reference evaluator.
 
         Args:
@@ -132,12 +137,12 @@ class GroupPoints:
         part = self.plan.parts[name]
         shape = (stop - first, *self.plan.shape)
         if isinstance(part, Node) and name in self.plan.extra:
-            array = self.plain_values.read_raw(part, first, stop)
+            array = self.reference_values.read_raw(part, first, stop)
         else:
             array = None
         if array is None:
             if isinstance(part, Node):
-                array = self.plain_values.array(part)
+                array = self.reference_values.array(part)
             else:
                 array = np.asarray(part)
             if isinstance(part, Node) and len(array) > 1:
@@ -149,7 +154,7 @@ class GroupPoints:
     @classmethod
     def make(
         cls, plan: Plan, batch: Batch, group: LayoutRows, remembered: Mapping[int, Column]
-    ) -> GroupPoints:
+    ) -> LayoutGroup:
         """Return a group for some packets of a batch.
 
         Args:
@@ -157,7 +162,7 @@ class GroupPoints:
                 number.
         """
         own = batch.of(group)
-        share = cls(plan, group, PlainValues(own), own)
+        share = cls(plan, group, ReferenceValues(own), own)
         for number, column in remembered.items():
             node = plan.tape.nodes[number]
             if len(column.array) > 1:
@@ -165,17 +170,17 @@ class GroupPoints:
             else:
                 array = column.array
             corner = (slice(None), *(slice(0, length) for length in node.shape))
-            share.plain_values.set_value(node, Column(array[corner], node.sample.axes, own))
+            share.reference_values.set_value(node, Column(array[corner], node.sample.axes, own))
         return share
 
-    def take(self, which: NDArray[np.intp]) -> GroupPoints:
+    def take(self, which: NDArray[np.intp]) -> LayoutGroup:
         """Return a group with some of the packets of this group."""
         remembered = {
-            node.number: self.plain_values.column(node)
+            node.number: self.reference_values.column(node)
             for node in self.plan.eager_nodes
             if node.kind in STATEFUL_KINDS
         }
-        return GroupPoints.make(
+        return LayoutGroup.make(
             self.plan,
             self.batch,
             LayoutRows(self.group.layout, which, self.group.rows[which]),

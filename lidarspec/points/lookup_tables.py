@@ -40,7 +40,8 @@ class FieldWindow:
     """The one or two bytes that contain a field, read as a little-endian integer.
 
     Attributes:
-        offset: the offset of the bytes in the frame, or in its first array elements.
+        offset: the offset of the bytes in the frame. If the field is in arrays, the offset of the
+            bytes of the first element.
         size: the number of bytes, 1 or 2.
     """
 
@@ -93,7 +94,10 @@ def tabulate_values(node: Node, leaf: Leaf) -> NDArray[Any] | None:
 
 
 def list_possible_values(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
-    """Return all possible values of an expression, (256,) or (65536,), or None."""
+    """Return all possible values of an expression, (256,) or (65536,).
+
+    Returns None unless the expression depends on exactly one field, in one or two bytes.
+    """
     source = get_only_field(node)
     if source is not None:
         leaf = leaves.get(source.path)

@@ -82,7 +82,8 @@ class Plan:
         parts: the parts of the result of `points`, by name, as nodes or constant arrays.
         shape: the shape of the points of a packet, one length for each axis in `axes`.
         expressions: the columns that back ends compute, by name, as nodes or arrays.
-        sent: the fields with the raw integers of columns in `extra`, by the name of the column.
+        raw_fields: for each column in `extra` that consists of the raw integers of a field: this
+            field, by the name of the column.
         exact: whether coordinates and range are computed in float64 in the written order.
         positive: nodes whose values have to be positive numbers for the plan to be valid.
         varying: the arrays whose lengths differ from frame to frame.
@@ -126,7 +127,8 @@ class Plan:
             is_full(self.parts[name], self.width) for name in ("xyz" if self.exact else ["range"])
         ):
             raise UntraceableError(
-                f"several points share the same {'coordinates' if self.exact else 'range'}"
+                f"`points` does not return {'coordinates' if self.exact else 'a range'} for each"
+                " point of a packet"
             )
         self.positive = list[Node]()
         named = {
@@ -145,12 +147,12 @@ class Plan:
         expressions |= {
             name: self.parts[name] for name, kind in self.extra.items() if kind.dtype == np.float32
         }
-        self.sent = {
+        self.raw_fields = {
             name: leaf
             for name, kind in self.extra.items()
             if (leaf := self._find_sent_field(self.parts[name], kind.dtype)) is not None
         }
-        expressions |= {name: self.parts[name] for name in self.sent}
+        expressions |= {name: self.parts[name] for name in self.raw_fields}
         self.expressions = {name: graph.get_node(value) for name, value in expressions.items()}
 
     @cached_property

@@ -62,7 +62,8 @@ class EvaluatedPoints:
     Attributes:
         source: the columns of the points, flat, in stream order.
         ready: the number of packets with points; all later packets wait for the next batch.
-        counts: (ready, ...) 1 for each point and 0 for padding, with an axis for each array level.
+        counts: 1 for each point and 0 for padding, (ready, ...). The axes after the first are those
+            of the nested arrays that contain the points.
         axes: the names of the axes of `counts` after the first.
         batch: all packets of the batch.
     """
@@ -94,14 +95,14 @@ def evaluate_plainly(
     carry: Carry | None = None,
     *,
     final: bool = True,
-    epoch: int | None = None,
+    stamp_ns: int | None = None,
 ) -> EvaluatedPoints:
     """Return the points of a batch, computed by the reference evaluator.
 
     Args:
         carry: the state left by the previous batch.
         final: whether no packets follow. If True, the result has the points of all packets.
-        epoch: the stamp of the cloud, int64 ns; by default the time of the first packet.
+        stamp_ns: the stamp of the cloud, int64 ns; by default the time of the first packet.
 
     Raises:
         PluginError: if the plugin's function fails or returns columns of a wrong shape.
@@ -117,13 +118,13 @@ def evaluate_plainly(
             raise TypeError(
                 f"the function must return Polar or Cartesian, got {type(result).__name__}"
             )
-        return _make_points(packets, result, batch, find_stamp(packets, epoch), final=final)
+        return _make_points(packets, result, batch, find_stamp(packets, stamp_ns), final=final)
 
 
-def find_stamp(packets: PacketBatch, epoch: int | None) -> int:
-    """Return the stamp of a cloud, int64 ns: `epoch`, or else the time of the first packet."""
-    if epoch is not None:
-        return epoch
+def find_stamp(packets: PacketBatch, stamp_ns: int | None) -> int:
+    """Return the stamp of a cloud, int64 ns: `stamp_ns`, or else the time of the first packet."""
+    if stamp_ns is not None:
+        return stamp_ns
     if len(packets):
         return int(packets.time_ns[0])
     return 0
@@ -155,11 +156,11 @@ def _make_points(
     ready = len(packets) if final else ready
     mask = make_value_mask(axes, shape, batch)
     every = {
-        name: flatten_valid(array, shape, mask, ready)
+        name: flatten_points(array, shape, mask, ready)
         for name, array in zip(parts, arrays, strict=True)
     }
     offsets = conventions.seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))
-    every["time"] = every["time"] + flatten_valid(offsets, shape, mask, ready)
+    every["time"] = every["time"] + flatten_points(offsets, shape, mask, ready)
     if mask is None:
         inside = np.ones(shape, np.bool_)
     else:
@@ -200,10 +201,15 @@ def _find_grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conv
     return conventions.Grids(np.cumsum(counts), which.reshape(-1), grids)
 
 
-def flatten_valid(
+def flatten_points(
     array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int
 ) -> NDArray[Any]:
-    """Broadcast an array to a shape, and return the values of all points, (N,)."""
+    """Broadcast an array to a shape, and return the values of the points, (N,).
+
+    Args:
+        mask: True for points, False for padding; None if there is no padding.
+        ready: the number of packets whose points are returned.
+    """
     full = np.broadcast_to(array, shape)[:ready]
     if mask is None:
         return full.reshape(-1)

@@ -162,7 +162,7 @@ class ScanStream:
         self._waiting = None
         if self._epoch is None:
             self._epoch = packets.time_ns.item(0)
-        points = evaluate_guarded(packets, self._carry, final=final, epoch=self._epoch)
+        points = evaluate_guarded(packets, self._carry, final=final, stamp_ns=self._epoch)
         if points is None:
             return []
         self._carry = points.carry

@@ -113,8 +113,8 @@ def test_kernels_equal_the_reference_evaluator(name: str) -> None:
         if len(packets):
             assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud, ulps=ULPS)
             one, other = (
-                evaluate(packets, final=False, epoch=5),
-                evaluate_plainly(packets, final=False, epoch=5),
+                evaluate(packets, final=False, stamp_ns=5),
+                evaluate_plainly(packets, final=False, stamp_ns=5),
             )
             assert_same_points(one.cloud, other.cloud, ulps=ULPS)
 

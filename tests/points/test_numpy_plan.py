@@ -95,8 +95,8 @@ def assert_planned_points_are_the_plain_ones(packets: Packets) -> None:
     if len(packets):
         assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud)
         one, other = (
-            evaluate(packets, final=False, epoch=5),
-            evaluate_plainly(packets, final=False, epoch=5),
+            evaluate(packets, final=False, stamp_ns=5),
+            evaluate_plainly(packets, final=False, stamp_ns=5),
         )
         assert one.ready == other.ready
         assert_same_points(one.cloud, other.cloud)

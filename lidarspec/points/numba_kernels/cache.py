@@ -49,7 +49,10 @@ class StoredKernel:
         self._name = name
 
     def load_overload(self, signature: object, target: Any) -> Any:
-        """Return the code that an earlier run compiled; None without authentic code."""
+        """Return the code that an earlier run compiled.
+
+        Returns None if no code is stored, or if its digest shows that it was changed.
+        """
         from numba.core.compiler import CompileResult
 
         with contextlib.suppress(Exception):  # if this fails, Numba compiles the kernel
@@ -160,7 +163,7 @@ def _read(path: Path) -> bytes:
     ) as file:
         status = os.fstat(file.fileno())
         if describe_sharing(status, _SHARED_PERMISSIONS) or not stat.S_ISREG(status.st_mode):
-            raise PermissionError(f"{path} is accessible to other users")
+            raise PermissionError(f"{path} can be read or changed by other users: remove it")
         return file.read()
 
 

@@ -196,7 +196,14 @@ _SHARES_BY_SEAL: WeakKeyDictionary[Seal, _ByteShares] = WeakKeyDictionary()
 
 
 def checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64] | None:
-    """Return the checksums of frames, (n,); None if NumPy should compute them."""
+    """Return the checksums of frames, (n,).
+
+    Returns None if a kernel cannot compute the checksums faster than NumPy.
+
+    Args:
+        seal: the checksum of the frame type.
+        rows: the frames, (n, size).
+    """
     shares = _SHARES_BY_SEAL.get(seal)
     if shares is None and not seal.spans:
         return None  # over no bytes there is nothing to compute

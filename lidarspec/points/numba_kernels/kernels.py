@@ -58,8 +58,11 @@ class Kernel(ColumnMaker):
         return self._function is not None
 
     @functools.cached_property
-    def is_compiled(self) -> bool:
-        """Whether the code was loaded or on disk when this property was first read."""
+    def was_stored(self) -> bool:
+        """Whether the code did not have to be compiled when this property was first read.
+
+        This is so if the code was already loaded or on disk.
+        """
         return self.is_ready or is_code_available(self._text.source)
 
     def compile(self) -> None:

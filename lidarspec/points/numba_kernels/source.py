@@ -134,7 +134,7 @@ class Expressions(KernelWriter):
     def _write_double(self, node: Node) -> KernelValue:
         if node.kind == "field":
             return self._write_physical(node)
-        if node.kind == "call" and not self.is_shared(node):
+        if node.kind == "call" and not self.uses_only_other_frames(node):
             source = get_only_field(node)
             if source is not None and is_full(source, self.width) and not is_cheap(node):
                 text = self.look_up(node, source, np.float64, 1.0)
@@ -143,7 +143,7 @@ class Expressions(KernelWriter):
                         return self.let(text.level, f"{text.text} != 0")
                     return text
             return self._write_call(node)
-        if node.kind == "rows" and not self.is_shared(node.args[0]):
+        if node.kind == "rows" and not self.uses_only_other_frames(node.args[0]):
             return self._look_up_row(node, "float64")
         return self.add_argument(node)
 
@@ -177,16 +177,16 @@ class Expressions(KernelWriter):
         )
         return self.let(1 + count_used_axes(node.shape), f"at({name}, {start.text} + {place})")
 
-    def is_shared(self, node: Node) -> bool:
+    def uses_only_other_frames(self, node: Node) -> bool:
         """Return whether an expression depends only on frames of other types."""
         # NumPy computes such an expression, usually once for all packets.
-        return self.get_or_make(("shared", node), lambda: self._is_shared(node))  # type: ignore[no-any-return]
+        return self.get_or_make(("shared", node), lambda: self._uses_only_other_frames(node))  # type: ignore[no-any-return]
 
-    def _is_shared(self, node: Node) -> bool:
+    def _uses_only_other_frames(self, node: Node) -> bool:
         if node.kind in ("state", "on"):
-            return node.kind == "state" or self.is_shared(node.args[0])
+            return node.kind == "state" or self.uses_only_other_frames(node.args[0])
         return node.kind == "call" and all(
-            self.is_shared(arg) for arg in node.args if isinstance(arg, Node)
+            self.uses_only_other_frames(arg) for arg in node.args if isinstance(arg, Node)
         )
 
     def _write_call(self, node: Node) -> KernelValue:
@@ -264,20 +264,22 @@ class Expressions(KernelWriter):
             ),
         )
 
-    def write_single(self, value: Any, *, exact: bool = False, root: bool = False) -> Any:
+    def write_single(self, value: Any, *, exact: bool = False, is_column: bool = False) -> Any:
         """Return the float32 code of an expression: a `KernelValue` or `DeferredFloat`.
 
         Args:
-            exact: whether to compute the value in float64 and round it once.
-            root: whether the expression is a whole coordinate, in which sums may be float32.
+            exact: whether to compute the value in float64, and round only the result to float32.
+            is_column: whether the expression is a whole column, such as a coordinate, and not a
+                part of an expression. If it is a sum, it is then computed in float32.
         """
         if not isinstance(value, Node):
             return self.write_constant(value, len(self.shape), "float32")
         return self.get_or_make(
-            ("single", value, exact), lambda: self._write_single(value, exact=exact, root=root)
+            ("single", value, exact),
+            lambda: self._write_single(value, exact=exact, is_column=is_column),
         )
 
-    def _write_single(self, node: Node, *, exact: bool, root: bool) -> Any:
+    def _write_single(self, node: Node, *, exact: bool, is_column: bool) -> Any:
         value = self._write_field(node, exact=exact)
         if value is not None:
             return value
@@ -285,16 +287,18 @@ class Expressions(KernelWriter):
         if value is not None:
             return value
         if is_full(node, self.width) and node.kind == "call" and not exact:
-            beam = find_beam(node, self.layout.leaves) if root else None
+            beam = find_beam(node, self.layout.leaves) if is_column else None
             along = self._write_along_beam(beam) if beam is not None else None
             if along is not None:
                 return along
-            if node.function is np.multiply or (root and node.function in (np.add, np.subtract)):
+            if node.function is np.multiply or (
+                is_column and node.function in (np.add, np.subtract)
+            ):
                 sign = {np.multiply: "*", np.add: "+", np.subtract: "-"}[node.function]
                 return self.combine(sign, *(self.write_single(arg) for arg in node.args))
             if node.function in (np.cos, np.sin) and is_full(node.args[0], self.width):
                 return Trig(node.function.__name__, self.add_angle(node.args[0]))
-        if node.kind == "rows" and not self.is_shared(node.args[0]) and not exact:
+        if node.kind == "rows" and not self.uses_only_other_frames(node.args[0]) and not exact:
             return self._look_up_row(node, "float32")
         made = self.write_double(node)
         return self.let(
@@ -308,8 +312,8 @@ class Expressions(KernelWriter):
         table = beam.direction.args[1]
         if (
             sent is None
-            or self.is_shared(beam.direction.args[0])
-            or self.is_shared(beam.start.args[0])
+            or self.uses_only_other_frames(beam.direction.args[0])
+            or self.uses_only_other_frames(beam.start.args[0])
         ):
             return None
         high, low, _ = self.get_or_make(
@@ -407,7 +411,11 @@ class Expressions(KernelWriter):
         """
         if not isinstance(value, Node):
             return self.write_constant(np.asarray(value) * factor, depth)
-        if not is_full(value, self.width) or value.kind != "call" or self.is_shared(value):
+        if (
+            not is_full(value, self.width)
+            or value.kind != "call"
+            or self.uses_only_other_frames(value)
+        ):
             return self._write_scaled(value, factor)
         source = get_only_field(value)
         if source is not None and not is_cheap(value):
@@ -493,7 +501,7 @@ class KernelText:
 
     Attributes:
         source: the source of a module with the function `kernel`.
-        wanted: the arguments of the kernel.
+        wanted: the arguments of the kernel that depend on the plan.
         columns: the dtypes of the columns that it fills, by name.
     """
 
@@ -550,7 +558,7 @@ class KernelAssembly:
             self.writer.lines[-1].append(f"put({name}, k, {value.text})")
         return f"at({self._kept[value.text]}, k)"
 
-    def list_turns(self) -> list[str]:
+    def list_trig_lines(self) -> list[str]:
         """Return the lines of the flat loop over points that compute cosines and sines."""
         return [
             f"cos{index}, sin{index} = cos_sin({self._store(made, 'float64')})"
@@ -571,7 +579,8 @@ def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Kerne
     writer.both = _find_cos_sin_angles(expressions.values())
     made = {name: _make_value(writer, plan, name, value) for name, value in expressions.items()}
     columns = {
-        name: plan.extra[name].dtype if name in plan.sent else np.dtype(np.float32) for name in made
+        name: plan.extra[name].dtype if name in plan.raw_fields else np.dtype(np.float32)
+        for name in made
     }
     if plan.exact:
         directions = []
@@ -586,9 +595,9 @@ def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Kerne
     for name, value in made.items():
         if name not in places:
             assembly.store_column(name, value)
-    turns = assembly.list_turns()
+    trig_lines = assembly.list_trig_lines()
     return KernelText(
-        HEAD + _write_function(writer, assembly, turns, columns), writer.wanted, columns
+        HEAD + _write_function(writer, assembly, trig_lines, columns), writer.wanted, columns
     )
 
 
@@ -604,11 +613,11 @@ def _find_cos_sin_angles(expressions: Iterable[Any]) -> set[Node]:
 
 def _make_value(writer: Expressions, plan: Plan, name: str, value: Any) -> Any:
     exact = plan.is_exact(name)
-    if name in plan.sent:
-        raw = writer.write_raw(plan.sent[name])
+    if name in plan.raw_fields:
+        raw = writer.write_raw(plan.raw_fields[name])
     else:
         raw = None
-    if name in plan.sent:
+    if name in plan.raw_fields:
         made = raw or writer.write_double(value, len(writer.shape))
         return writer.let(made.level, f"np.{plan.extra[name].dtype}({made.text})")
     if name == "azimuth" or (exact and name != "intensity"):
@@ -616,18 +625,18 @@ def _make_value(writer: Expressions, plan: Plan, name: str, value: Any) -> Any:
         return writer.let(
             made.level, f"{'narrow_angle' if name == 'azimuth' else 'np.float32'}({made.text})"
         )
-    return writer.write_single(value, exact=name == "intensity", root=True)
+    return writer.write_single(value, exact=name == "intensity", is_column=True)
 
 
 def _write_function(
     writer: KernelWriter,
     assembly: KernelAssembly,
-    turns: list[str],
+    trig_lines: list[str],
     columns: Mapping[str, np.dtype[Any]],
 ) -> str:
     """Return the source of the kernel's function, with its signature and its loops."""
     width = writer.format_number(writer.width)
-    if turns:
+    if trig_lines:
         held = writer.format_number(max(SCRATCH_POINTS // writer.width, 1))
     else:
         held = "count"
@@ -665,9 +674,9 @@ def _write_function(
         "        base = p * stride",
         *(f"        {text}" for text in loops),
     ]
-    if turns:
+    if trig_lines:
         body += [f"    for k in range((end - begin) * {width}):", "        o = start + k"]
-        body += [f"        {text}" for text in (*turns, *assembly.flat)]
+        body += [f"        {text}" for text in (*trig_lines, *assembly.flat)]
     head = f'@compile_kernel(STORED, ({types},), error_model="numpy")\ndef kernel({arguments}):\n'
     return head + "".join(f"    {text}\n" for text in body)
 

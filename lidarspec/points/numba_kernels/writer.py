@@ -74,7 +74,9 @@ def is_cheap(node: Node) -> bool:
 
 
 def write_integer(leaf: Leaf, byte: Any) -> str | None:
-    """Return the raw value of a field as an expression of its bytes, or None.
+    """Return the raw value of an integer field as an expression of the bytes of the field.
+
+    Returns None for floating-point fields, integers of more than 48 bits, and arrays in bit blocks.
 
     Args:
         byte: a function that returns the expression of the byte at an offset.
@@ -215,11 +217,11 @@ class KernelArguments:
 
 
 def find_run(leaf: Leaf) -> tuple[str, int, int, int] | None:
-    """Return the position of an unsigned field in at most four bytes.
+    """Return which bytes contain an unsigned field.
 
     Returns:
-        The byte order, the first byte, the number of bytes and the lowest bit; None for other
-        fields.
+        The byte order, the first byte, the number of bytes and the lowest bit; None if the field is
+        not an unsigned integer in at most four consecutive bytes.
     """
     if len(leaf.shape) > len(leaf.strides):
         return None
@@ -452,7 +454,9 @@ class KernelWriter:
         return leaf.offset <= first or inside
 
     def look_up(self, node: Node, source: Node, kind: Any, factor: float) -> KernelValue | None:
-        """Return the text of a lookup that replaces an expression of one field, or None.
+        """Return the text of a lookup that replaces an expression of one field.
+
+        Returns None if the field is not in one or two bytes.
 
         Args:
             source: the field.

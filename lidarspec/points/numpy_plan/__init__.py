@@ -27,8 +27,8 @@ def compile(plan: Plan, names: tuple[str, ...]) -> ColumnMaker:
 def _compile(plan: Plan, names: tuple[str, ...], tables: dict[Any, NDArray[Any]]) -> Compiler:
     compiler = Compiler(plan, tables)
     for name in names:
-        if name in plan.sent:
-            compiler.add_integers(name, plan.sent[name])
+        if name in plan.raw_fields:
+            compiler.add_integers(name, plan.raw_fields[name])
             continue
         kind = "double" if name == "azimuth" else "single"
         compiler.add_column(name, plan.expressions[name], kind, exact=plan.is_exact(name))

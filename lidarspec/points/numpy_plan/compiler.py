@@ -42,7 +42,8 @@ class Compiler:
 
     Attributes:
         program: the program, with an output for each column that was added.
-        low: the inputs of the program, which are nodes with one value for each packet or block.
+        low: the nodes with one value for each packet or block, which the reference evaluator
+            computes and the program reads.
     """
 
     def __init__(self, plan: Plan, tables: dict[Any, NDArray[Any]]) -> None:
@@ -250,7 +251,7 @@ class Compiler:
         return self._tables[name]
 
     def _load_whole(self, leaf: Leaf, kind: str) -> int | None:
-        """Load a field in its unit; return None if this requires float64."""
+        """Load a field and convert it to its unit; return None if this requires float64."""
         info = leaf.info
         assert info.dtype is not None
         if kind == "single" and (info.dtype.itemsize > 4 or (info.scaled and self._is_exact)):
@@ -293,7 +294,10 @@ class Compiler:
         return self.program.add_step(f"{leaf.info.path}: {dtype} at byte {offset}", kind, run)
 
     def _look_up_rows(self, node: Node, kind: str) -> int | None:
-        """Compile a lookup of rows of a table; return None if the rows are not whole."""
+        """Compile a lookup of rows of a table.
+
+        Returns None unless a row contains one value for each point that has the same index.
+        """
         index, table = node.args
         inner = table.shape[1]
         inner_shape = self._shape[count_used_axes(index.shape) :]
@@ -341,7 +345,7 @@ class Compiler:
         return self.program.add_step(f"sum of {len(parts)} products", "double", run)
 
     def _add_term(self, sum_: int, part: Term) -> int:
-        """Add a term with a value for each point to a sum."""
+        """Add a term to a sum. The term has a value for each point."""
         assert part.full is not None
         before = RegisterRead(sum_)
         full = RegisterRead(self._compile_double(part.full))
