@@ -1,8 +1,9 @@
 """Weak frame types, which are accepted only in runs of consecutive frames.
 
 Frames of a type with `confirm=k` are accepted only if at least k valid frames follow one another
-without a gap. The whole run is then accepted. For example, a frame of five bytes without a checksum
-may be valid at every sixth offset of random bytes.
+without a gap. The whole run is then accepted. The reason is that a short frame without a checksum
+is often valid by chance: a frame of five bytes may be valid at every sixth offset of random bytes.
+A run of such frames is rarely valid by chance.
 
 The first candidate of a run of at least k frames is called a *head*. The search handles a head as
 one candidate, with the end of the run as its end.
@@ -26,11 +27,12 @@ class WeakRuns:
 
     Attributes:
         frames: the n candidates of the type that are valid or incomplete, sorted by offset.
-        following: the row of the candidate that follows each candidate in its run, (n + 2,); n at
-            the end of a run, n + 1 if more bytes are needed.
+        following: for each candidate, the row of the next candidate in its run, (n + 2,). The row
+            is n if the run ends, and n + 1 if more bytes are needed. The last two elements map
+            n to n, and n + 1 to n + 1.
         confirm: the minimum length of a run that is accepted.
-        is_single: whether frames have to be accepted one at a time, because the type changes the
-            active types.
+        is_single: whether frames have to be accepted one at a time, because a frame of this type
+            changes which frame types are searched after it.
     """
 
     frames: Frames
@@ -60,7 +62,7 @@ class WeakRuns:
         return heads
 
     def find_row(self, offset: int) -> int | None:
-        """Return the index of the valid candidate at an offset; None without one."""
+        """Return the row of the candidate at an offset; None if no valid one is there."""
         row = int(self.frames.starts.searchsorted(offset))
         if row == len(self.frames) or self.frames.starts.item(row) != offset:
             return None
@@ -96,7 +98,7 @@ class WeakRuns:
 
 def find_runs(
     candidates: Frames,
-    earlier: Frames,
+    preferred: Frames,
     *,
     confirm: int,
     is_single: bool,
@@ -106,12 +108,12 @@ def find_runs(
 
     Args:
         candidates: the candidates of the type with any status, sorted by offset.
-        earlier: the valid and incomplete candidates of types that are declared before this type,
-            sorted by offset.
+        preferred: the valid and incomplete candidates of the types that are declared before this
+            type, sorted by offset.
         final: whether no bytes follow, so that incomplete candidates are invalid.
     """
-    # The next frame of a run begins directly after the last byte of a frame. If a frame of an
-    # earlier type begins there, the run ends.
+    # The next frame of a run begins directly after the last byte of a frame. If a frame of a
+    # preferred type begins there, the run ends.
     frames = candidates.select(candidates.status <= (VALID if final else SHORT))
     is_short = frames.status == SHORT
     count = len(frames)
@@ -125,8 +127,8 @@ def find_runs(
     own[is_found] = rows[is_found]
     if not final:
         own[(stops >= len(frames.buffer)) | (is_found & is_short[rows])] = waits
-    rows, is_found = _find_rows(earlier.starts, stops)
-    own[is_found] = np.where(earlier.status[rows[is_found]] == SHORT, waits, ends_here)
+    rows, is_found = _find_rows(preferred.starts, stops)
+    own[is_found] = np.where(preferred.status[rows[is_found]] == SHORT, waits, ends_here)
     own[is_short] = waits
     return WeakRuns(frames, following, confirm, is_single)
 
