@@ -221,14 +221,16 @@ class BackgroundWriter:
             ):
                 raise SourceTimeout(
                     f"{self.path}: the disk did not store the recording within"
-                    f" {DISK_TIMEOUT_S:.0f} s"
+                    f" {DISK_TIMEOUT_S:.0f} s; the newest data may be missing in the file:"
+                    " record to a faster disk"
                 )
         self._raise_failure()
 
     def wait_for_room(self) -> None:
         """Wait until there is memory for more records.
 
-        Call this regularly when the source can wait, such as a file.
+        Call this regularly while reading from a source that loses no data by waiting, such as a
+        file.
 
         Raises:
             SourceError: if the file cannot be written, or the disk is too slow.
@@ -246,10 +248,10 @@ class BackgroundWriter:
         self._raise_failure()
 
     def discard(self) -> bool:
-        """Remove the closed file, which contains no records.
+        """Remove the new file. Call this only if the file was closed without records.
 
         Returns:
-            False if the path still has an older file, which was not replaced.
+            True if no file is left at the path; False if an older file is there, which was kept.
         """
         if not self._file.replaces:
             with contextlib.suppress(OSError):

@@ -17,8 +17,8 @@ A recording is a sequence of independent records. The first is the header, in JS
 
 An event is a JSON object. Its entry "event" is "disconnect", "reconnect", "dropped" or "clock". For
 "dropped", the entry "records" is the number of dropped records. "clock" means that the wall clock
-was set, which does not change the arrival times; "ahead_ns" is the wall clock minus the arrival
-time. Readers skip unknown kinds of records.
+was set during the recording. The arrival times continue without this step, and "ahead_ns" is the
+wall clock minus the arrival time. Readers skip unknown kinds of records.
 
 A record is used only if its checksum is valid. The reader stops at the first damaged record, or
 continues with the next valid record (`salvage`). If the recording process is killed, the file ends
@@ -359,8 +359,8 @@ class Recording(ClosingContext):
             self.header = read_header(first[1].data)
             if self.header.version > VERSION:
                 raise SourceError(
-                    f"{self.path}: written in format {self.header.version}, but this version"
-                    f" supports format {VERSION}"
+                    f"{self.path}: the recording has format {self.header.version}, but this version"
+                    f" of lidarspec reads formats up to {VERSION}: update lidarspec"
                 )
             return self._keep_known(pairs)
         if not self.salvage:
@@ -469,9 +469,9 @@ def _pack_endpoint(address: Address | None) -> bytes:
 
 @lru_cache(maxsize=256)
 def _read_endpoints(data: bytes) -> list[Address | None] | None:
-    """Return the sender and the receiver of a record; None for invalid bytes.
+    """Return [sender, receiver] of a record; an unknown address in the list is None.
 
-    An unknown address is None.
+    Returns None instead of the list if the bytes are invalid.
     """
     addresses: list[Address | None] = []
     offset = 0
