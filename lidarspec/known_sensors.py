@@ -99,8 +99,11 @@ def known_sensors() -> tuple[KnownSensor, ...]:
         return tuple(KnownSensor.from_dict(row) for row in json.load(file))
 
 
-def describe_entry_points(entries: Iterable[EntryPoint]) -> list[KnownSensor]:
-    """Return the rows of the table that are correct for the installed distributions.
+def select_known_sensors(entries: Iterable[EntryPoint]) -> list[KnownSensor]:
+    """Return the rows of the table that describe installed sensors.
+
+    A row is returned if its distribution is installed in the same version, and if the entry points
+    of a sensor are exactly the id and the aliases in the row.
 
     Args:
         entries: the entry points of all installed sensors.
@@ -116,12 +119,15 @@ def describe_entry_points(entries: Iterable[EntryPoint]) -> list[KnownSensor]:
     ]
 
 
-def list_described_sensors() -> list[KnownSensor] | None:
-    """Return a row for each installed sensor, sorted by id; None if rows are missing."""
+def list_sensors_from_table() -> list[KnownSensor] | None:
+    """Return the row of each installed sensor, sorted by id.
+
+    Returns None if the table does not have a row for every installed sensor.
+    """
     if entry_points(GROUP):
         return None
     entries = entry_points(SENSORS)
-    rows = describe_entry_points(entries)
+    rows = select_known_sensors(entries)
     described = {name for row in rows for name in row.names}
     if len(described) == len(entries):
         return rows
@@ -150,7 +156,12 @@ def _keep_letters(name: str) -> str:
 
 
 def install_command(*distributions: str, extra: str = "") -> str:
-    """Return the command that installs distributions of this project."""
+    """Return the command that installs distributions of this project.
+
+    Args:
+        distributions: the names of the distributions.
+        extra: the extra that is installed with each distribution; "" for none.
+    """
     extras = f"[{extra}]" if extra else ""
     plugins = os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), "plugins")
     if os.path.isdir(plugins):

@@ -15,7 +15,9 @@ DRAWING = "lidarspec.view.notebook"
 
 
 def make_display_method(kind: str) -> Callable[[Any], str | None]:
-    """Return a method that returns a value as HTML, or None to display it as text.
+    """Return a method that displays its object in a notebook.
+
+    The method returns the object as HTML, or None if the notebook has to display the text.
 
     Args:
         kind: the name of the function in `lidarspec.view.notebook` that draws the value.

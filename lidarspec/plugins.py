@@ -52,7 +52,7 @@ from lidarspec.errors import (
 from lidarspec.known_sensors import (
     KnownLink,
     KnownSensor,
-    describe_entry_points,
+    select_known_sensors,
     unknown_sensor_error,
 )
 from lidarspec.sensor_operations import Sensor
@@ -104,15 +104,15 @@ def lidarspec_link(source: str, link: Link, host: str | None) -> Any:
     """Return the open transport of a link that lidarspec does not support, or None.
 
     Args:
-        source: the source of the data.
-        link: the declared link, for commands.
+        source: the URL of the source that was opened.
+        link: the link that the sensor declares, over which commands are to be sent.
         host: the address of the sensor; None if unknown.
     """
 
 
 @hookspec
 def lidarspec_verbs() -> Iterable[click.Command]:  # type: ignore[empty-body]
-    """Return the command-line verbs that a module adds.
+    """Return the subcommands that a module adds to the command `lidarspec`.
 
     The module must be named in the entry-point group `lidarspec.verbs`.
     """
@@ -216,8 +216,9 @@ class Registry:
     If several plugins have a sensor of the same name (id or alias), these rules decide, in this
     order, which plugin provides the sensor:
 
-    * A plugin with an entry point of this name, or with hooks, has priority over a plugin whose
-      sensor only declares the name.
+    * A plugin with an entry point of this name, or whose hook `lidarspec_sensors` returns the
+      sensor, has priority over a plugin in which the name is only an id or alias of a sensor whose
+      entry point has another name.
     * The user's settings may name the distribution that owns the name.
     * `lidarspec-VENDOR` owns the ids that begin with VENDOR, and the aliases of these sensors.
     * If one distribution has two modules with the name, the first module provides the sensor.
@@ -464,8 +465,8 @@ class Registry:
         ]
 
     def list_sensors(self) -> list[KnownSensor]:
-        """Return a row for each installed sensor, sorted by id."""
-        described = describe_entry_points(itertools.chain.from_iterable(self._offered.values()))
+        """Return a `KnownSensor` for each installed sensor, sorted by id."""
+        described = select_known_sensors(itertools.chain.from_iterable(self._offered.values()))
         names = {(row.distribution, name) for row in described for name in row.names}
         for entries in self._offered.values():
             for entry in entries:
@@ -700,8 +701,8 @@ def _import_in_time(entry: EntryPoint) -> Any:
     thread.join(LOAD_WARNING_S)
     if thread.is_alive():
         warnings.warn(
-            f"{entry.distribution}: {entry.module} has been loading for {LOAD_WARNING_S:g} s; next:"
-            " lidarspec plugins",
+            f"{entry.distribution}: {entry.module} has been loading for {LOAD_WARNING_S:g} s; if it"
+            " hangs, lidarspec plugins shows where",
             stacklevel=2,
         )
         thread.join(max(LOAD_TIMEOUT_S - LOAD_WARNING_S, 0))

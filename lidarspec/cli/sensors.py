@@ -14,7 +14,7 @@ from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import emit, emit_json, output_options, table
 from lidarspec.cli.terminal import note, say
 from lidarspec.errors import LidarSpecError, SpecError
-from lidarspec.known_sensors import KnownLink, KnownSensor, list_described_sensors, no_sensors_text
+from lidarspec.known_sensors import KnownLink, KnownSensor, list_sensors_from_table, no_sensors_text
 from lidarspec.trusted_files import FILE, TRUSTED, trust as trusted, user_folder
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def list_sensors() -> tuple[list[KnownSensor], list[Plugin]]:
     """Return facts about each installed sensor, and the plugins that failed to load."""
     # If the plugins are loaded, the program may have registered sensors of its own.
     is_fresh = "lidarspec.plugins" not in sys.modules
-    rows = list_described_sensors() if is_fresh else None
+    rows = list_sensors_from_table() if is_fresh else None
     if rows is not None:
         return rows, []
     from lidarspec.plugins import registry
