@@ -148,8 +148,9 @@ PARAMETERS = (
     Parameter(
         "scan_ring",
         -1,
-        "The ring that is published as LaserScan, if the sensor has several rings. -1: no ring is"
-        " selected.",
+        "The ring that is published as LaserScan, if the sensor has several rings. -1: the points"
+        " between scan_z_min and scan_z_max; if these are equal, only planar sensors have LaserScan"
+        " messages.",
         -1,
         1 << 16,
         live=True,
@@ -180,7 +181,7 @@ PARAMETERS = (
     Parameter(
         "use_device_time",
         True,
-        "Stamp messages by the sensor's clock, converted to the host's time. If false, by the"
+        "Stamp messages with the sensor's time, converted to the host's time. If false, with the"
         " arrival time.",
         live=True,
     ),
