@@ -165,7 +165,7 @@ class WrapDetector:
 class PassDetector:
     """Finds the rows at which an angle passes a given angle, in a known direction.
 
-    A step may leap over the given angle. It may be of almost a whole turn.
+    A step may leap over the given angle, and may be almost a whole turn.
 
     Args:
         at: the angle to pass, in turns.

@@ -397,8 +397,8 @@ def _check_facts(sensor: SensorDescription) -> None:
     for name, frame in sensor.frames.items():
         if frame.endless is not None and not _comes_in_datagrams(sensor, frame):
             raise SpecError(
-                f"{frame.endless.reason}. Such a frame cannot be found in a byte stream, and"
-                " requires a link with datagrams",
+                f"{frame.endless.reason}. Such a frame has no end in a byte stream, so it must be"
+                " sent as a datagram",
                 path=f"{name}.{frame.endless.path}".strip("."),
                 sensor=sensor.id,
                 rule=frame.endless.rule,

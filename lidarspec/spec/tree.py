@@ -1207,7 +1207,9 @@ def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
         if not isinstance(known, Ref) or not known.info.labels:
             continue
         if symbol not in ("==", "!=") or not isinstance(pair[one], int | str):
-            raise UntraceableExpressionError("an expression uses an Enum field as a number")
+            raise UntraceableExpressionError(
+                "an expression uses an Enum field as a number, but its parsed value is a name"
+            )
         if pair[one] in known.info.labels:
             name = known.info.labels[pair[one]]
             outcome = "never" if symbol == "==" else "always"

@@ -418,7 +418,9 @@ class _Builder:
             elif not isinstance(value, tree.Symbol):
                 reason = f"the value of the expression is always {value!r}, which is no integer"
             elif not is_key and isinstance(value.formula, tree.Ref) and value.formula.info.labels:
-                reason = "an expression uses an Enum field as a number"
+                reason = (
+                    "an expression uses an Enum field as a number, but its parsed value is a name"
+                )
             elif fraction is not None and not may_be_fraction:
                 reason = f"the result of an expression with {fraction!r} is not always an integer"
             else:
