@@ -342,9 +342,9 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
 
 
 def make_operation(symbol: str, *args: Formula) -> Formula:
-    """Return the formula of an operation; an integer if all operands are integers.
+    """Return the formula of an operation.
 
-    Only additions, subtractions and multiplications of integers are calculated.
+    A sum, difference or product of integers is returned as an integer.
     """
     if all(isinstance(arg, int) for arg in args) and symbol in ("+", "-", "*"):
         return int(_OPERATIONS[symbol](*args))

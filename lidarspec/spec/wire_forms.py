@@ -861,10 +861,10 @@ class Echoes:
 class SixBits:
     """Numbers in characters of six bits each, the highest bits first.
 
-    It is used as ``Lines(...) | SixBits()``. A number of n bytes is sent as n characters, so only
-    its lowest 6 * n bits are sent: an `Int16ub` as two, an `Int24ub` as three, and an `Int32ub` as
-    four characters. The value of a character is its code minus the code of `first`. With the
-    default, an `Int8ub` for a character "0" to "9" therefore has the value of this decimal digit.
+    It is used as ``Lines(...) | SixBits()``. A number of n bytes is sent as n characters: an
+    `Int16ub` as two, an `Int24ub` as three, and an `Int32ub` as four characters. Only the lowest
+    6 * n bits of the number are sent. The value of a character is its code minus the code of
+    `first`. With the default, the characters "0" to "9" therefore have the values 0 to 9.
 
     Args:
         first: the character for 0.

@@ -3,9 +3,9 @@
 `prepare` replaces a class of construct if the class loses bytes, does not report the offset of an
 error, or always verifies values, so that `parse(verify=False)` would be impossible.
 
-Most frames have a layout and are read and built without construct, so these classes run only for
-frames without a layout (`lidarspec.frames.plain`). `tests/frames/test_plain.py` reads such frames,
-and fails if a class is not replaced.
+Most frames have a layout, and are parsed and built without construct. These classes parse and build
+the other frames (`lidarspec.frames.plain`). `tests/frames/test_plain.py` tests such frames, and
+fails if a class of construct is not replaced.
 
 Plugins use the new classes through `lidarspec.spec.fields`.
 """
