@@ -122,7 +122,8 @@ def select_known_sensors(entries: Iterable[EntryPoint]) -> list[KnownSensor]:
 def list_sensors_from_table() -> list[KnownSensor] | None:
     """Return the row of each installed sensor, sorted by id.
 
-    Returns None if the table does not have a row for every installed sensor.
+    Returns None if the table does not have a row for every installed sensor, or if a module with
+    hooks is installed, which may add sensors.
     """
     if entry_points(GROUP):
         return None

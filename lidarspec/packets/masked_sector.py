@@ -225,7 +225,7 @@ class GapLoss(Protocol):
 
     Attributes:
         missing: the number of packets that count as lost.
-        masked: the number of packets that a masked sector leaves out.
+        masked: the number of packets of the gap that a masked sector leaves out.
     """
 
     missing: int
