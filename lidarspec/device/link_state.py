@@ -86,9 +86,11 @@ class LinkState:
     def name(self) -> str:
         """The state of the link.
 
-        "disconnected"; "silent": nothing arrives from the sensor; "no frames": bytes arrive, but
-        they contain no frame; "waiting": no frame has arrived yet, but the link has no problem so
-        far; "streaming".
+        * "disconnected": the device is disconnected.
+        * "silent": the sensor has sent nothing for `SILENT_AFTER_S`.
+        * "no frames": bytes arrive, but they contain no frames.
+        * "waiting": no frame has arrived so far, and none of these problems was found.
+        * "streaming": frames have arrived.
         """
         if not self._capture.connected:
             return "disconnected"

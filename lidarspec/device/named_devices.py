@@ -137,7 +137,7 @@ def find_device(source: str | Path) -> NamedDevice | None:
 
     Raises:
         UsageError: for a mistake in the settings file, or for a device that is not allowed. If
-            devices are declared, also for a word that is neither one of their names nor a file.
+            devices are declared, also if `source` is a word that is neither a name nor a file.
         SourceError: if the settings file cannot be read.
     """
     word = str(source)

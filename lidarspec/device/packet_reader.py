@@ -35,7 +35,8 @@ class PacketReader:
         frame: the frame type; None for the data frame type that arrives first.
 
     Attributes:
-        last_packets: the packets that `read_packets` returned last; None before.
+        last_packets: the packets that `read_packets` returned last; None before
+            the first packets.
         imu_samples: the IMU samples of the last batch.
     """
 

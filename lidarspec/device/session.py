@@ -563,7 +563,7 @@ class Session:
         if self._use_refusal(line, item, values, now):
             return
         if current is None or current.expected is None:
-            differs = ["not requested"]
+            differs = ["no command waits for a reply"]
         else:
             differs = current.expected.find_differences(item.frame, values)
         if current is not None and not differs and now >= current.sent[0]:
