@@ -253,10 +253,10 @@ def _has_valid_checksum(checksum: ChecksumMatch, frame: bytes) -> bool:
 
 
 def _find_count_field(draft: Draft, stream: bytes) -> Draft:
-    """Return the draft with the field that counts the elements, if it is found.
+    """Return the draft with a field that counts elements, if such a field is found.
 
-    The stream ends in an incomplete frame. If all frames before it have the same value in a byte,
-    but the incomplete frame has another value, this byte is probably the number of elements.
+    The stream may end in an incomplete frame. If all frames before it have the same value in a
+    byte, but the incomplete frame has another value, this byte is probably the number of elements.
     """
     if draft.size is None or draft.datagrams or not draft.frames:
         return draft
