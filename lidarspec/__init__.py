@@ -9,12 +9,18 @@ This module has the functions and classes for reading a lidar. The classes for d
 are in `lidarspec.spec`, and the exceptions in `lidarspec.errors`. All are imported on first use, so
 that ``lidarspec --help`` starts quickly.
 
-The packages are listed in the order in which data passes through them:
+These packages lead from the description of a sensor to its scans:
 
-    spec        description of a sensor        packets     frames of one type as columns
-    frames      parsing and building a frame   points      packets as point clouds
-    expressions columns for plugin functions   scans       revolutions of points
-    framing     finding frames in bytes        device      a sensor on a source
+    spec         description of a sensor
+    frames       parsing and building a frame
+    framing      finding frames in bytes
+    expressions  evaluation of plugin functions on columns of values
+    packets      frames of one type as columns
+    points       packets as point clouds
+    scans        revolutions of points
+    device       a sensor on a source
+
+The other packages use them, or give them bytes:
 
     transports  serial ports, sockets, files   simulation  simulated sensors
     captures    pcap files of other tools      recording   received bytes with arrival times

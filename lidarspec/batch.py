@@ -85,7 +85,8 @@ class FilePiece:
     Attributes:
         source: the path or URL of the file.
         sensor: the sensor's id; "" to detect the sensor.
-        target: the path of the output, without the number of the piece; "" without output.
+        target: the path of the output, to which `output` adds the number of the piece; "" if the
+            points are not written to a file.
         every_point: whether to include points without a valid return.
         number: the number of the piece in the file, from 0.
         first: the number of the piece's first scan in the file, from 0.
@@ -132,7 +133,7 @@ class FilePiece:
         return {"asked": self.sensor, **how, "target": self.target}
 
     def open_scans(self) -> FileScans:
-        """Open the file at the start of the piece."""
+        """Open the file, and return a reader of its scans from the start of the piece."""
         if self.sensor:
             named = _configure_sensor(self.sensor, tuple(self.options.items()))
         else:
@@ -158,7 +159,11 @@ class FilePiece:
         return self.make_record(error=reason)
 
     def iter_numbered(self, scans: FileScans) -> Iterator[Scan]:
-        """Yield the selected scans of the piece, with their numbers in the file."""
+        """Yield the scans of the piece that `select` selects, numbered from the file's start.
+
+        Args:
+            scans: the reader that `open_scans` has returned.
+        """
         sieve = ScanSelector(self.select, self.source)
         for number, scan in enumerate(itertools.islice(scans, self.count), self.first):
             if (wanted := sieve.select(scan)) is not None:
@@ -178,8 +183,12 @@ def _configure_sensor(name: str, options: tuple[tuple[str, Any], ...]) -> Sensor
     return configured
 
 
-def survey(piece: FilePiece) -> list[FilePiece]:
-    """Return the piece with its number of scans, and the next piece if there is one."""
+def find_piece_end(piece: FilePiece) -> list[FilePiece]:
+    """Read a file from the start of a piece, to find where the piece ends.
+
+    Returns:
+        The piece with the number of its scans; and the next piece, if the file continues.
+    """
     with piece.open_scans() as scans:
         count, bookmark = scans.survey(piece.size)
     if bookmark is None:
@@ -314,7 +323,7 @@ class Manifest:
             if self._store_line(line, number)
         ]
         self._outputs = files_in(folder)
-        self.is_new = not self.has(self.path)
+        self.is_new = not self.existed_before(self.path)
         if not self._is_stored:
             with system_errors(self.path):
                 Path(folder).mkdir(parents=True, exist_ok=True)
@@ -337,16 +346,17 @@ class Manifest:
         except ValueError:
             return False
         except RecursionError:
-            raise SourceError(
-                f"{self.path}: line {number}: brackets are nested too deeply"
-            ) from None
+            error = SourceError(
+                f"line {number} of {self.path} is no record: its brackets are nested too deeply"
+            )
+            raise suggest(error, "delete the line; the piece is then converted again") from None
         if not _is_record(record):
             return False
         self._records.setdefault((record["source"], record["target"]), {})[record["piece"]] = record
         return True
 
-    def has(self, path: str) -> bool:
-        """Return whether the folder contained a file before this run."""
+    def existed_before(self, path: str) -> bool:
+        """Return whether a file was in the folder before this run."""
         return normalise_path(path) in self._outputs
 
     def find_finished(self, piece: FilePiece) -> Record | None:
@@ -358,7 +368,7 @@ class Manifest:
             or any(record.get(name) != value for name, value in piece.settings.items())
         ):
             return None
-        is_there = record["output"] is None or self.has(record["output"])
+        is_there = record["output"] is None or self.existed_before(record["output"])
         if is_there and self._is_unchanged(piece.source, record):
             return record
         return None
@@ -382,13 +392,13 @@ class Manifest:
                 return records
         return []
 
-    def clear(self, piece: FilePiece) -> None:
-        """Remove the outputs of a file if the file or the settings have changed."""
+    def remove_outdated_outputs(self, piece: FilePiece) -> None:
+        """Remove the outputs of an input file if the input or the settings have changed."""
         for number, record in self._records.get((piece.source, piece.target), {}).items():
             output = record.get("output")
             if (
                 output
-                and self.has(output)
+                and self.existed_before(output)
                 and self.find_finished(replace(piece, number=number)) is None
             ):
                 remove(output)
@@ -400,7 +410,7 @@ class Manifest:
             self._lines.append(line)
             if (now := time.monotonic()) >= self._due:
                 self._due = now + MANIFEST_PERIOD_S
-                self._put()
+                self._upload_lines()
             return
         self._file.write(f"{line}\n")
         self._file.flush()
@@ -408,11 +418,11 @@ class Manifest:
     def close(self) -> None:
         """Write the remaining records, and close the file."""
         if self._is_stored:
-            self._put()
+            self._upload_lines()
         else:
             self._file.close()
 
-    def _put(self) -> None:
+    def _upload_lines(self) -> None:
         with tempfile.TemporaryDirectory() as folder:
             local = Path(folder) / MANIFEST
             local.write_text("".join(f"{line}\n" for line in self._lines), encoding="utf-8")
@@ -502,8 +512,9 @@ def convert(
         scheduler: the address of a Dask scheduler. Its workers need access to the sources and the
             folder.
         every_point: whether to include points without a valid return.
-        select: the selected scans of each file. A file is not cut if its scans are selected by time
-            or number.
+        select: the scans to convert, and the parts of each scan. A file is not cut into pieces if
+            `select` needs all earlier scans of the file: with `times`, `scans`, `every`, or the
+            time "utc".
         size: the size of a piece in bytes. A file that is larger than a piece is cut, and has
             several outputs.
         force: whether to convert finished pieces again.
@@ -522,7 +533,7 @@ def convert(
         if taken := [
             piece.target
             for piece in todo
-            if manifest.is_new and not force and manifest.has(piece.target)
+            if manifest.is_new and not force and manifest.existed_before(piece.target)
         ]:
             error = UsageError(
                 f"{taken[0]} exists already and was not overwritten: the folder has no {MANIFEST},"
@@ -534,7 +545,7 @@ def convert(
             yield from ((record, True) for records in finished.values() for record in records)
             todo = [piece for piece in todo if not finished[piece.source]]
         for piece in todo:
-            manifest.clear(piece)
+            manifest.remove_outdated_outputs(piece)
         with _remove_partial_files(folder, to), _open_executor(jobs, scheduler) as executor:
             for record, is_old in _iter_results(
                 executor, todo, (lambda _: None) if force else manifest.find_finished
@@ -550,7 +561,7 @@ def _iter_results(
     """Yield the record of each finished piece, and whether it is from an earlier run."""
     # While one task searches for the start of the next piece, others convert earlier pieces.
     ended = queue.SimpleQueue[tuple[FilePiece, Future[Any]]]()
-    tasks = deque((survey if _is_large(piece) else convert_piece, piece) for piece in todo)
+    tasks = deque((find_piece_end if _is_large(piece) else convert_piece, piece) for piece in todo)
     running = 0
     most_running = 1 if isinstance(executor, _InProcessExecutor) else MAX_RUNNING_TASKS
 
@@ -575,12 +586,12 @@ def _iter_results(
             raise suggest(
                 error, "repeat the command: it converts only the missing pieces"
             ) from None
-        except Exception as failure:  # an error of a survey, or a Dask worker that died repeatedly
+        except Exception as failure:  # of `find_piece_end`, or a Dask worker died repeatedly
             result = piece.describe_failure(failure)
         if isinstance(result, dict):
             yield result, False
             continue
-        tasks.extendleft((survey, following) for following in result[1:])
+        tasks.extendleft((find_piece_end, following) for following in result[1:])
         if (record := done(result[0])) is None:
             tasks.appendleft((convert_piece, result[0]))
         else:
@@ -604,7 +615,10 @@ def _check_format(to: str) -> None:
 
 @contextlib.contextmanager
 def _remove_partial_files(folder: str, to: str) -> Iterator[None]:
-    """Remove partial files of killed processes from a folder, on entry and on exit."""
+    """Remove partial files from a folder when the context begins and when it ends.
+
+    Processes that were killed have left these files.
+    """
 
     def sweep() -> None:
         for path in () if is_remote(folder) else Path(folder).rglob(f".*.{to}"):
@@ -628,15 +642,16 @@ def read(
 ) -> Any:
     """Return the points of many files as a Dask dataframe, one partition per piece.
 
-    The columns are those of a Parquet file. This function reads through large files to cut them
-    into pieces. Dask computes the points when it needs them.
+    The columns are those that `convert` writes to a Parquet file. This function reads through large
+    files to cut them into pieces. Dask computes the points when it needs them.
 
     Args:
         urls: paths, patterns such as "s3://bucket/drives/**/*.pcap", and URLs of fsspec.
         sensor: an id, a path or a Sensor; by default, the sensor of each file is detected.
         every_point: whether to include points without a valid return.
-        select: the selected scans of each file. A file is not cut if its scans are selected by time
-            or number.
+        select: the scans to read, and the parts of each scan. A file is not cut into pieces if
+            `select` needs all earlier scans of the file: with `times`, `scans`, `every`, or the
+            time "utc".
         size: the size of a piece in bytes. The points of a piece take about ten times as much
             memory.
 
@@ -668,7 +683,7 @@ def _cut_into_pieces(piece: FilePiece) -> list[FilePiece]:
     pieces = list[FilePiece]()
     following = [piece]
     while following:
-        first, *following = survey(following[0])
+        first, *following = find_piece_end(following[0])
         pieces.append(first)
     return pieces
 

@@ -446,7 +446,7 @@ def _manifest(folder: Path) -> Target:
         (results / MANIFEST).write_bytes(data)
         with contextlib.closing(Manifest(str(results))) as manifest:
             manifest.find_records(piece)
-            manifest.clear(piece)
+            manifest.remove_outdated_outputs(piece)
 
     def examples() -> list[bytes]:
         source.write_bytes(b"")
