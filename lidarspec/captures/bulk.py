@@ -119,7 +119,18 @@ class RecordKind:
 
 
 def make_record_kind(record: bytes, datagram: Datagram, form: Form) -> RecordKind | None:
-    """Return the kind of a record; None if its first bytes do not determine the kind."""
+    """Return the kind of a record, with which similar records are found.
+
+    Args:
+        record: the bytes of the record.
+        datagram: the datagram in the record.
+        form: the record reader of the file.
+
+    Returns:
+        None if all such records must be read singly: the packet is reassembled or truncated, its
+        headers are longer than `MAX_HEADER_BYTES`, `form` has no layout for the record, or its
+        times may exceed 64 bits.
+    """
     headers = datagram.headers
     pattern = form.find_layout(record)
     if headers is None or pattern is None:
@@ -153,6 +164,9 @@ def find_records(
     storage: NDArray[np.uint8], start: int, stop: int, form: Form
 ) -> tuple[Indices, bool]:
     """Return the offsets of the complete records between `start` and `stop`.
+
+    Args:
+        form: the record reader of the file.
 
     Returns:
         (The start of each record, followed by the end of the last record; whether `form.read` must
@@ -215,8 +229,9 @@ class CapturedDatagrams:
             a view of it is still in use.
         starts: (n,) offset of each payload in the buffer.
         sizes: (n,) length of each payload, bytes.
-        at: (n,) int64 arrival times, ns since 1970; -1 if unknown.
-        senders: (n,) indices into `names`.
+        at: (n,) int64 arrival times, ns since 1970; 0 if a record has no time.
+        senders: (n,) index in `names` of each datagram's sender.
+        names: (address, port) of each sender in the batch.
         gap: whether datagrams before this batch were skipped.
     """
 
@@ -243,8 +258,8 @@ class CapturedDatagrams:
             return gather_rows(self.buffer, self.starts, size).tobytes()
         return b"".join(map(self.data, range(len(self))))
 
-    def of(self, origin: Origin) -> CapturedDatagrams:
-        """Return the datagrams from a requested sender."""
+    def select_sender(self, origin: Origin) -> CapturedDatagrams:
+        """Return only the datagrams from senders that match `origin`."""
         if all(name in origin for name in self.names):
             return self
         wanted = np.array([name in origin for name in self.names], np.bool_)[self.senders]
@@ -298,10 +313,11 @@ class CapturedDatagrams:
 class CaptureBatches(CaptureReader):
     """Reads the datagrams of a capture in batches of arrays.
 
-    To read single datagrams, iterate over the reader. Use either iteration or `batches`, not both.
+    Iteration yields single datagrams, as for `CaptureReader`. Use either iteration or `batches`,
+    not both.
     """
 
-    largest = MAX_BUFFER_BYTES
+    max_buffer_bytes = MAX_BUFFER_BYTES
 
     def batches(self) -> Iterator[CapturedDatagrams]:
         """Yield the datagrams of the file, in one batch for each filled buffer."""
@@ -328,7 +344,7 @@ class CaptureBatches(CaptureReader):
                     self._skip_damage(form)
                 elif ended is not None:
                     raise ended
-                kinds = block.select_known()
+                kinds = block.rank_kinds()
 
 
 class StreamBatches(StreamReader, CaptureBatches):
@@ -336,7 +352,11 @@ class StreamBatches(StreamReader, CaptureBatches):
 
 
 class _RecordBlock:
-    """The complete records in the buffer, or the next record if none is complete."""
+    """The complete records in the buffer, or the one record to read singly.
+
+    There is one record if `find_records` found none: its length is implausible, or it is longer
+    than the data in the buffer.
+    """
 
     def __init__(
         self,
@@ -387,8 +407,8 @@ class _RecordBlock:
             self._source.at = int(self._starts[-1])
         return None
 
-    def select_known(self) -> list[RecordKind]:
-        """Return the kinds that later records may have, the most frequent first."""
+    def rank_kinds(self) -> list[RecordKind]:
+        """Return the kinds to compare with the next records, the most frequent first."""
         if self._form.sections != self._section:
             return []
         if len(self._known) == 1:
@@ -429,7 +449,7 @@ class _RecordBlock:
         )
 
     def _make_uniform_batch(self, kind: RecordKind) -> CapturedDatagrams:
-        """Return the batch if all records are of one kind."""
+        """Return the batch of these records, which are all of one kind."""
         number = len(self._at)
         self._reader.stats.packets += number - self._matched_singles
         sizes, senders = (np.broadcast_to(np.intp(fact), number) for fact in (kind.size, 0))
@@ -449,7 +469,11 @@ class _RecordBlock:
         matched: Indices,
         names: dict[Sender, int],
     ) -> NDArray[np.uint8]:
-        """Insert the separately read datagrams into the batch; return the new buffer."""
+        """Insert the singly read datagrams into `columns`, in the order of the records.
+
+        Returns:
+            `buffer`, followed by the payloads of these datagrams.
+        """
         data = b"".join(datagram.data for datagram in self._singles.values())
         at = len(buffer)
         rows = []

@@ -275,8 +275,8 @@ def _is_readable(archive: zipfile.ZipFile, member: str) -> bool:
     return is_capture(start) or start.startswith(MAGIC) or _detect_packing(start) is not None
 
 
-def refuse_container(path: str, start: bytes) -> None:
-    """Raise SourceError if a file is of an unsupported kind.
+def refuse_unsupported_file(path: str, start: bytes) -> None:
+    """Raise SourceError if a file is of a known kind that cannot be read.
 
     Args:
         start: the first `HEAD_BYTES` of the file, decompressed.

@@ -159,11 +159,12 @@ class UdpPacket(NamedTuple):
     stop: int
 
 
-class Headers(NamedTuple):
-    """The headers before the payload of an unfragmented UDP packet.
+class HeaderLayout(NamedTuple):
+    """The size of the headers of an unfragmented UDP packet, and the bytes that vary.
 
     Attributes:
         size: length of all headers together, bytes.
+        payload_size: length of the payload after the headers, bytes.
         variable_offsets: offsets of the checksums and of the IPv4 identification. All other header
             bytes are equal in packets of the same sender and size.
     """
@@ -216,13 +217,13 @@ def parse_udp(packet: IpPacket) -> UdpPacket:
     return UdpPacket(source, destination, start + _UDP_HEADER.size, start + length)
 
 
-def measure_headers(packet: IpPacket, udp: UdpPacket) -> Headers | None:
-    """Return the sizes of the headers of a UDP packet; None for a reassembled packet."""
+def measure_headers(packet: IpPacket, udp: UdpPacket) -> HeaderLayout | None:
+    """Return the layout of the headers of a UDP packet; None for a reassembled packet."""
     if not packet.body_offset:
         return None
     size = packet.body_offset + udp.start
     udp_checksum = (size - 2, size - 1)
-    return Headers(size, udp.stop - udp.start, (*udp_checksum, *packet.variable_offsets))
+    return HeaderLayout(size, udp.stop - udp.start, (*udp_checksum, *packet.variable_offsets))
 
 
 @lru_cache(maxsize=256)
@@ -502,9 +503,11 @@ class Reassembly:
             self._drop(key)
 
     def _drop(self, key: tuple[bytes, bytes, int]) -> None:
+        """Remove an incomplete packet, and count its fragments as dropped."""
         self.dropped += len(self._remove(key).parts)
 
     def _remove(self, key: tuple[bytes, bytes, int]) -> _PartialPacket:
+        """Remove a packet from the waiting packets, and return it."""
         partial = self._partials.pop(key)
         self._held_bytes -= partial.size + self._OVERHEAD_BYTES * len(partial.parts)
         return partial

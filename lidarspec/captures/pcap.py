@@ -19,7 +19,7 @@ from typing import BinaryIO
 from lidarspec.captures.containers import open_capture
 from lidarspec.captures.ip import (
     MAX_PAYLOAD_BYTES,
-    Headers,
+    HeaderLayout,
     NoDatagramError,
     Reassembly,
     build_udp_frame,
@@ -64,19 +64,19 @@ class Datagram:
         data: the payload.
         at: capture time in ns since 1970; 0 if the file has no times. For a fragmented datagram,
             the time of the last fragment.
-        headers: the sizes of the headers; None if the packet was reassembled or truncated.
+        headers: the layout of the headers; None if the packet was reassembled or truncated.
     """
 
     data: bytes
     at: int
     source: tuple[str, int]
     destination: tuple[str, int]
-    headers: Headers | None = field(default=None, compare=False)
+    headers: HeaderLayout | None = field(default=None, compare=False)
 
 
 @dataclass(slots=True)
 class CaptureStats:
-    """Counts of the contents of a capture that were read so far.
+    """Counts of the packets, and of the damage, that a reader has found in a capture.
 
     Attributes:
         others: protocol, such as "ARP" -> number of packets that are not UDP over IP.
@@ -131,13 +131,13 @@ class CaptureReader(ClosingContext):
             compressed.
 
     Attributes:
-        largest: maximum number of bytes to read at once.
+        max_buffer_bytes: maximum size of the read buffer, except for a longer record.
 
     Raises:
         SourceError: if the file cannot be read, or is not a capture. Damage is only counted.
     """
 
-    largest = MIN_BUFFER_BYTES
+    max_buffer_bytes = MIN_BUFFER_BYTES
 
     def __init__(self, file: BinaryIO | str | os.PathLike[str]) -> None:
         self.stats = CaptureStats()
@@ -145,7 +145,7 @@ class CaptureReader(ClosingContext):
         if isinstance(file, str | os.PathLike):
             self._owned = open_capture(file)
             file = self._owned
-        self._source = BufferedInput(file, largest=self.largest)
+        self._source = BufferedInput(file, max_buffer_bytes=self.max_buffer_bytes)
         self._fragments = Reassembly()
         self._form: Form | None = None
         self._datagrams: Iterator[Datagram] | None = None
@@ -213,7 +213,11 @@ class CaptureReader(ClosingContext):
 
     @contextmanager
     def _close_at_end(self) -> Iterator[None]:
-        """At the end of the context, close the file and complete the statistics."""
+        """Close the file and complete the statistics when the context ends.
+
+        The context contains the loop over the records. An incomplete last record ends the context
+        without an exception.
+        """
         try:
             yield
         except TruncatedError:
@@ -268,7 +272,12 @@ class StreamReader(CaptureReader):
     """Iterates over the packets of a captured byte stream, as datagrams."""
 
     def to_datagram(self, packet: CapturedPacket | NoPacketReason) -> Datagram | None:
-        """Count a packet and return its content; None for another link type."""
+        """Count a packet; return its bytes as a datagram, or None.
+
+        Returns:
+            None if the record has no packet, or if the link type of the packet is not in
+            `USER_LINKS`.
+        """
         if isinstance(packet, NoPacketReason):
             return None
         self.stats.packets += 1
@@ -279,12 +288,12 @@ class StreamReader(CaptureReader):
         if len(packet.data) < packet.original:
             self.stats.snapped += 1
         else:
-            headers = Headers(0, len(packet.data), ())
+            headers = HeaderLayout(0, len(packet.data), ())
         return Datagram(packet.data, packet.at, UNKNOWN_ENDPOINT, UNKNOWN_ENDPOINT, headers)
 
 
 def datagram_record(datagram: Datagram) -> bytes:
-    """Return the pcap record of one datagram.
+    """Make the pcap record that contains a datagram.
 
     Raises:
         UsageError: if the payload is too long, or an address, port or time is invalid.
@@ -293,7 +302,7 @@ def datagram_record(datagram: Datagram) -> bytes:
 
 
 def datagram_frame(datagram: Datagram) -> bytes:
-    """Return an unfragmented Ethernet frame that contains one datagram.
+    """Make an unfragmented Ethernet frame that contains a datagram.
 
     Raises:
         UsageError: if the payload is too long, or an address or port is invalid.
@@ -310,7 +319,7 @@ def datagram_frame(datagram: Datagram) -> bytes:
 
 
 def is_stream_capture(head: bytes) -> bool:
-    """Return whether a little-endian capture contains a byte stream.
+    """Return whether a capture contains a byte stream; False for big-endian captures.
 
     Args:
         head: the first bytes of the file, at least 24 bytes of pcap or 64 bytes of pcapng.

@@ -4,7 +4,8 @@
 record, with which `bulk` finds similar records. `seek_time` searches a file by capture time.
 
 Captures are untrusted: each read has a limited size, and each iteration of a loop advances or ends
-the reading. After a damaged record, `skip_damage` continues at the next two consecutive records.
+the reading. After a damaged record, `skip_damage` continues at the next record that it recognizes:
+in pcap by the record that follows, and in pcapng by the length that is repeated at the end.
 
 Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and "PCAP Now Generic
 Capture File Format" (draft-ietf-opsawg-pcapng).
@@ -108,9 +109,9 @@ class TimeEncoding:
 
     Attributes:
         word: NumPy type of the words, with the byte order.
-        high: index of the first word in the record: seconds, or the upper half of a 64-bit number.
-        low: index of the second word in the record: the fraction, or the lower half.
-        ticks: units per second of the fraction, or of the 64-bit number.
+        high: index in the record, in words, of the seconds or of the upper half of a 64-bit number.
+        low: index in the record, in words, of the fraction or of the lower half.
+        ticks: number of units in a second. The fraction, or the 64-bit number, counts these units.
         is_split: whether the words are seconds and a fraction, instead of a 64-bit number.
         offset: number of ns to add to each time.
     """
@@ -191,19 +192,21 @@ class PcapRecords:
         other._source = source
         return other
 
-    def find_length(self, data: memoryview | bytes, at: int) -> int:
-        """Return the length of the record at an offset; 0 if it is implausible.
+    def find_length(self, data: memoryview | bytes, offset: int) -> int:
+        """Return the length of the record at an offset; 0 if the length is implausible.
 
         Args:
             data: a buffer with at least 16 bytes after the offset.
         """
-        captured, original = self._lengths.unpack_from(data, at + 8)
+        captured, original = self._lengths.unpack_from(data, offset + 8)
         return self._head.size + captured if self._is_plausible(captured, original) else 0
 
     def length_field(self, length: int) -> tuple[int, str, int]:
-        """Return (offset, NumPy type, value) of the two length fields of a record.
+        """Return (offset, NumPy type, value) of the two length fields, read as one number.
 
-        The packet must not be truncated.
+        Args:
+            length: the length of a record whose packet is not truncated, so that both fields have
+                the same value.
         """
         captured: int = length - self._head.size
         return 8, f"{self.order}u8", captured << 32 | captured
@@ -284,8 +287,10 @@ class PcapRecords:
         return 0 < captured <= MAX_PACKET_BYTES and captured in (original, self._snap_length)
 
     def _has_wrong_length(self, captured: int, original: int) -> bool:
-        """Return whether the length of a record is wrong."""
-        # the length is wrong if it includes other records, and no record follows the packet
+        """Return whether a record begins within the packet, and none directly after it.
+
+        Then the lengths are wrong, because the packet would include other records.
+        """
         size = self._head.size + captured
         within = max(captured, min(original, MAX_PACKET_BYTES) + 1)
         data = self._source.peek(self._head.size + within + _REACH_BYTES)
@@ -321,17 +326,17 @@ class PcapngBlocks:
         other._interfaces = list(self._interfaces)
         return other
 
-    def find_length(self, data: memoryview | bytes, at: int) -> int:
+    def find_length(self, data: memoryview | bytes, offset: int) -> int:
         """Return the length of the block at an offset; 0 if `read` must read the block."""
         kind: int
         length: int
-        kind, length = struct.unpack_from(self.order + "II", data, at)
+        kind, length = struct.unpack_from(self.order + "II", data, offset)
         if kind == _SECTION_KIND or length > MAX_BLOCK_BYTES or not _is_possible_length(length):
             return 0
         return length
 
     def length_field(self, length: int) -> tuple[int, str, int]:
-        """Return (offset, NumPy type, value) of the length field of a block."""
+        """Return (offset, NumPy type, value) of the length field, for a length of a block."""
         return 4, f"{self.order}u4", length
 
     def find_layout(self, record: bytes) -> RecordLayout | None:
@@ -401,7 +406,7 @@ class PcapngBlocks:
         return min([*right[:1], *([section] if section is not None else [])], default=None)
 
     def _has_wrong_length(self, kind: int, length: int) -> bool:
-        """Return whether the length of a block is wrong."""
+        """Return whether a length is impossible, or contradicts the bytes of the block."""
         if not _is_possible_length(length) or (
             length > MAX_BLOCK_BYTES and kind in _PACKETS | {_INTERFACE}
         ):
@@ -448,11 +453,12 @@ def skip_damage(source: BufferedInput, form: Form) -> bool:
 def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
     """Skip packets that were captured before a time.
 
-    The packets must be in the order of their times. About `NEAR_BYTES` before the time are not
-    skipped. Skipping ends at the next section of a pcapng file.
+    The packets must be in the order of their times. The search is not exact: up to about
+    `NEAR_BYTES` of earlier packets are not skipped. Skipping ends at the next section of a pcapng
+    file.
 
     Args:
-        at: ns since 1970.
+        at: the time, ns since 1970.
 
     Returns:
         Whether packets were skipped; always False for a pipe or a compressed file.
@@ -550,7 +556,7 @@ def _parse_packet_block(
 
 
 def capture_head(link: int) -> bytes:
-    """Return the header of a little-endian pcap file with nanoseconds.
+    """Make the header of a little-endian pcap file with nanoseconds.
 
     Args:
         link: the link type: `ip.ETHERNET` for datagrams, USER0 for a byte stream.
@@ -559,7 +565,7 @@ def capture_head(link: int) -> bytes:
 
 
 def packet_record(data: bytes, at: int) -> bytes:
-    """Return the pcap record of one packet.
+    """Make the pcap record that contains a packet.
 
     Args:
         at: capture time, ns since 1970.
@@ -583,19 +589,21 @@ def _refuse_size(data: bytes) -> None:
         )
 
 
-def record_size(data: bytes | bytearray, at: int) -> int:
-    """Return the length of the record or file header at an offset."""
-    if at == 0 and is_capture(bytes(data[:4])):
+def record_size(data: bytes | bytearray, offset: int) -> int:
+    """Return the length of the record, or of the file header, at an offset."""
+    if offset == 0 and is_capture(bytes(data[:4])):
         return _HEAD.size
-    return _RECORD.size + int.from_bytes(data[at + 8 : at + 12], "little")
+    return _RECORD.size + int.from_bytes(data[offset + 8 : offset + 12], "little")
 
 
 class CaptureFormat(NamedTuple):
     """Functions that write captures of one format.
 
     Attributes:
+        head: returns the file header for a link type.
         record: returns the record for a packet and its time in ns since 1970.
-        size: returns the length of the record or file header at an offset of a piece of the file.
+        size: returns the length of the record, or of the file header, that begins at an offset. Its
+            arguments are a piece of the file, and the offset in this piece.
     """
 
     head: Callable[[int], bytes]
@@ -631,6 +639,6 @@ WRITINGS = {
     ".pcapng": CaptureFormat(
         _make_pcapng_head,
         _make_pcapng_record,
-        lambda data, at: int.from_bytes(data[at + 4 : at + 8], "little"),
+        lambda data, offset: int.from_bytes(data[offset + 4 : offset + 8], "little"),
     ),
 }

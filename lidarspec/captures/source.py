@@ -36,7 +36,7 @@ class BufferedInput:
     """A buffered reader of a file or pipe.
 
     Args:
-        largest: maximum size of the buffer in bytes, except for a longer record.
+        max_buffer_bytes: maximum size of the buffer, except for a longer record.
 
     Attributes:
         storage: the current buffer. Its last `SLACK_BYTES` are never filled.
@@ -45,24 +45,26 @@ class BufferedInput:
         offset: file offset of the next byte.
     """
 
-    def __init__(self, file: BinaryIO, *, largest: int = MIN_BUFFER_BYTES) -> None:
+    def __init__(self, file: BinaryIO, *, max_buffer_bytes: int = MIN_BUFFER_BYTES) -> None:
         self._file = file
         self._read_into = _get_read_function(file)
-        self._largest = largest
+        self._max_buffer_bytes = max_buffer_bytes
         self._viewed_buffers: list[tuple[NDArray[np.uint8], weakref.ref[Any]]] = []
         self._last_view: weakref.ref[Any] | None = None
         self._data = memoryview(b"")
         self._bytes_dropped = 0  # bytes of the file before `storage`
         self.record = self.at = 0
-        self._use_buffer(np.empty(_choose_buffer_size(file, largest) + SLACK_BYTES, np.uint8), 0)
+        self._use_buffer(
+            np.empty(_choose_buffer_size(file, max_buffer_bytes) + SLACK_BYTES, np.uint8), 0
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the arguments for pickling; the unpickled reader has the same offset."""
-        return _open_source_at, (self._file, self._largest, self.offset)
+        return _open_source_at, (self._file, self._max_buffer_bytes, self.offset)
 
     @property
     def stop(self) -> int:
-        """The number of filled bytes of `storage`."""
+        """The end of the filled part of `storage`, as an offset."""
         return len(self._data)
 
     @property
@@ -106,7 +108,7 @@ class BufferedInput:
     def take(self, size: int) -> bytes:
         """Return the next `size` bytes, and advance.
 
-        The caller must limit `size`, because the buffer grows to it.
+        The caller must limit `size`, because the buffer grows to `size` bytes.
 
         Raises:
             TruncatedError: if fewer bytes are left.
@@ -173,7 +175,7 @@ class BufferedInput:
             if have == size:
                 size = 2 * size
             else:
-                size = max(size, min(2 * size, self._largest))
+                size = max(size, min(2 * size, self._max_buffer_bytes))
         if self._last_view is not None:
             self._viewed_buffers = [
                 *self._viewed_buffers[1 - MAX_VIEWED_BUFFERS :],
@@ -201,10 +203,10 @@ class BufferedInput:
         self.at = 0
 
 
-def _open_source_at(file: BinaryIO, largest: int, offset: int) -> BufferedInput:
+def _open_source_at(file: BinaryIO, max_buffer_bytes: int, offset: int) -> BufferedInput:
     """Return a source of a seekable file that starts at an offset."""
     file.seek(offset)
-    source = BufferedInput(file, largest=largest)
+    source = BufferedInput(file, max_buffer_bytes=max_buffer_bytes)
     source.record = source._bytes_dropped = offset
     return source
 
@@ -225,11 +227,11 @@ def _copy_bytes(file: BinaryIO, buffer: memoryview) -> int:
     return len(data)
 
 
-def _choose_buffer_size(file: BinaryIO, largest: int) -> int:
+def _choose_buffer_size(file: BinaryIO, max_buffer_bytes: int) -> int:
     try:
         status = os.fstat(file.fileno())
     except (AttributeError, OSError):
         return MIN_BUFFER_BYTES
     if stat.S_ISREG(status.st_mode):
-        return min(max(status.st_size, MIN_BUFFER_BYTES), largest)
+        return min(max(status.st_size, MIN_BUFFER_BYTES), max_buffer_bytes)
     return MIN_BUFFER_BYTES

@@ -23,7 +23,7 @@ from lidarspec.captures.containers import (
     find_damage,
     open_capture,
     peek_head,
-    refuse_container,
+    refuse_unsupported_file,
     unpack,
 )
 from lidarspec.captures.pcap import CaptureStats, is_stream_capture
@@ -306,7 +306,7 @@ class CaptureTransport(FileTransport):
             if self._origin is None:
                 mine = batch
             else:
-                mine = batch.of(self._origin)
+                mine = batch.select_sender(self._origin)
             self.foreign += len(batch) - len(mine)
             if len(mine):
                 yield replace(mine, gap=True) if self._take_gap() else mine
@@ -369,7 +369,7 @@ def open_file(
                 f"{name} is {log.description}{' in a compressed file' * (file is not plain)}:"
                 " pass the path of an uncompressed file"
             )
-        refuse_container(name, start)
+        refuse_unsupported_file(name, start)
         if log is not None and is_remote(path):
             raise SourceError(
                 f"{path} is {log.description}, which can only be read from a local file: copy"

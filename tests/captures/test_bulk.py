@@ -372,7 +372,7 @@ def address(batch: CapturedDatagrams) -> int:
 def test_unreferenced_buffers_are_reused(
     long_capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(CaptureBatches, "largest", 1 << 21)
+    monkeypatch.setattr(CaptureBatches, "max_buffer_bytes", 1 << 21)
     places = [address(batch) for batch in CaptureBatches(long_capture).batches()]
     assert len(places) > 12
     assert len(set(places)) <= 3
@@ -416,7 +416,7 @@ def test_whoever_holds_a_view_of_a_buffer_keeps_it(
 def test_packets_of_a_file_stay_right_while_the_file_is_read_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(CaptureBatches, "largest", 1 << 21)
+    monkeypatch.setattr(CaptureBatches, "max_buffer_bytes", 1 << 21)
     from tests.captures.test_memory import SENSOR, write_repeated_capture
 
     path = tmp_path / "kept.pcap"

@@ -35,7 +35,7 @@ SENT = Datagram(bytes(1000), 0, ("192.168.1.201", 2368), UNKNOWN_ENDPOINT)
 @pytest.fixture(autouse=True)
 def _near(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lidarspec.captures.records, "NEAR_BYTES", NEAR)
-    monkeypatch.setattr(CaptureBatches, "largest", NEAR)
+    monkeypatch.setattr(CaptureBatches, "max_buffer_bytes", NEAR)
     monkeypatch.setattr(contents, "MAX_BEGINNING_BYTES", 4 * NEAR)
 
 

@@ -119,7 +119,7 @@ def test_pieces_have_the_scans_of_one_pass(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module, size in (
-        (lidarspec.captures.bulk.CaptureBatches, "largest"),
+        (lidarspec.captures.bulk.CaptureBatches, "max_buffer_bytes"),
         (lidarspec.transports.files, "BLOCK_BYTES"),
     ):
         monkeypatch.setattr(module, size, 1 << 13)
