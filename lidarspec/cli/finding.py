@@ -14,7 +14,7 @@ import click
 
 from lidarspec.cli.clock import diagnose_clock
 from lidarspec.cli.failures import DEVICE, FINDINGS, NO_DATA
-from lidarspec.cli.inputs import read
+from lidarspec.cli.inputs import read_sample
 from lidarspec.cli.options import DURATION, sensor_option
 from lidarspec.cli.output import Progress, emit, emit_json, output_options, table
 from lidarspec.cli.terminal import note, verbosity
@@ -38,7 +38,7 @@ from lidarspec.detect.listen import (
     read_samples,
 )
 from lidarspec.detect.sample_bytes import SampleBytes
-from lidarspec.detect.uninstalled_sensors import describe, install_commands, recognize
+from lidarspec.detect.uninstalled_sensors import describe, make_install_command, recognize
 from lidarspec.drafting.checksum_search import search
 from lidarspec.drafting.periods import FrameStructure, find_structure, split_frames
 from lidarspec.drafting.samples import ChecksumMatch
@@ -105,7 +105,7 @@ def _list_sensors_at_port(port: int) -> list[str]:
 
 def _describe_port(port: SerialPort) -> str:
     if not port.allowed:
-        return "no permission: lidarspec doctor"
+        return "no permission; next: lidarspec doctor"
     if port.users:
         return f"in use by {', '.join(map(str, port.users))}"
     return "free"
@@ -176,10 +176,10 @@ def crc(
 def _parse_frames(words: Sequence[str], period: int | None, offset: int) -> list[bytes]:
     if len(words) == 1 and (words[0] == "-" or os.path.exists(words[0])):
         return _read_frames(words[0], period, offset)
-    whole = read(words).data
+    whole = read_sample(words).data
     if period is not None:
         return split_frames(whole, period, offset)
-    each = [read([word]).data for word in words]
+    each = [read_sample([word]).data for word in words]
     if min(map(len, each)) > 2:
         return each
     return [whole]
@@ -195,7 +195,7 @@ def _read_frames(path: str, period: int | None, offset: int) -> list[bytes]:
         chunks = sample.chunks
         datagrams = sample.datagrams
     else:
-        sample_bytes = read([path])
+        sample_bytes = read_sample([path])
         chunks = tuple(chunk for chunk in sample_bytes.chunks if chunk)
         datagrams = (
             path.endswith(HEX) and len(chunks) > 1 and max(map(len, chunks)) < MAX_DATAGRAM_BYTES
@@ -251,14 +251,14 @@ def _describe_match(match: ChecksumMatch, length: int) -> str:
             f"{match.algorithm.describe()}{name}: correct in {match.right} of {match.total} frames;"
             f" {chance}"
         ),
-        f"  field: {match.place}{order}",
-        f"  over:  {match.span.describe(match.place, length)}",
-        *(f"  note:  {remark}" for remark in match.remarks),
+        f"  field:  {match.place}{order}",
+        f"  covers: {match.span.describe(match.place, length)}",
+        *(f"  note:   {remark}" for remark in match.remarks),
     ]
     if "\n" in match.source:
         paste = f"\n{indent(match.source, '    ')}"
     else:
-        paste = f" {match.source}"
+        paste = f"  {match.source}"
     return "\n".join([*lines, f"  paste:{paste}"])
 
 
@@ -286,8 +286,9 @@ def detect(
     SOURCE is a port, a file or a capture. Without SOURCE, all serial ports are tried at the baud
     rates of the installed sensors, and the UDP ports of these sensors are tried as well. Sensors
     are ranked by the share of the bytes that are in frames with a valid checksum and plausible
-    values. If sensors have the same frames, they are distinguished by clock, baud rate or a model
-    name in the frames, if possible. -v also lists the sensors that were ruled out.
+    values. Models with the same frames are distinguished, if possible, by packets that only one
+    model sends, by the clock step per packet, by a model name in the frames, or by the baud rate.
+    -v also lists the sensors that were ruled out.
     """
     if source == "-":
         raise suggest(
@@ -329,7 +330,7 @@ def detect(
 
 
 def _find_exit_code(source: str | None, verdicts: Sequence[Verdict]) -> int:
-    """Return the exit code if no sensor fits."""
+    """Return the exit code of `detect` for input that no sensor fits."""
     is_live = source is None or live_address(source) is not None
     is_silent = is_live and not any(verdict.sample.size for verdict in verdicts)
     if is_silent:
@@ -388,6 +389,7 @@ def _find_structure(verdicts: Sequence[Verdict]) -> FrameStructure | None:
 
 
 def _format_detected(verdicts: Sequence[Verdict], output: str | None) -> str:
+    """Return a table of the sensors that fit each source."""
     rows = []
     for verdict in verdicts:
         alike = {score.sensor.id for score in verdict.candidates}
@@ -474,7 +476,7 @@ def _iter_conclusions(
         return
     if missing:
         yield describe(missing)
-        yield f"next: {install_commands(missing)}"
+        yield f"next: {make_install_command(missing)}"
         return
     if size:
         if any(verdict.sample.is_text for verdict in verdicts):

@@ -3,9 +3,9 @@
 The bytes are decoded with each installed sensor. `rate_sensors` returns the share of the bytes that
 are in valid frames of a sensor. `identify_sample` selects the sensor with the largest share.
 
-Related models have the same frames. `distinguish` compares packets that only one model sends, the
-clock step per packet, and the model name in a frame. If none of these differs, all related models
-remain possible, including models that are not installed.
+Related models have the same frames. `distinguish` looks for packets that only one of the models
+sends, for the clock step per packet of one model, and for a model name in the frames. If none of
+these decides, all related models remain possible, including models that are not installed.
 
 `find_fitting_sensors` and `find_nearest_fault` examine a single frame.
 """
@@ -100,7 +100,7 @@ def distinguish(candidates: Sequence[Sensor], frames: Mapping[str, Sequence[Foun
     """
     ids = {sensor.id for sensor in candidates}
     excluding = {
-        sensor.id: _find_excluding_relatives(sensor, frames[sensor.id]) for sensor in candidates
+        sensor.id: _find_sending_relatives(sensor, frames[sensor.id]) for sensor in candidates
     }
     left = [sensor for sensor in candidates if not excluding[sensor.id]]
     reasons = {name: why for relatives in excluding.values() for name, why in relatives.items()}
@@ -148,8 +148,10 @@ def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
     return f"{sensor.reported['model'].paths[0]} is {names[0]}"
 
 
-def _find_excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
-    """Return the related models that sent packets which the sensor never sends.
+def _find_sending_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
+    """Return the related models that must have sent the frames instead of a sensor.
+
+    More than half of the packets are then packets that only the related model sends.
 
     Returns:
         Id of the related model -> its difference from the sensor.
@@ -299,21 +301,21 @@ def read_info(sensor: Sensor, frames: Iterable[Found]) -> dict[str, str]:
     items = sorted(frames, key=lambda item: item.offset)
     texts = dict[str, str]()
     for role, fact in sensor.reported.items():
-        reporting = [item for item in items if _reports(sensor, fact, item)]
+        reporting = [item for item in items if _is_fact_in_frame(sensor, fact, item)]
         if reporting:
             item = reporting[-1]
             texts[role] = _describe_fact(fact, *_read_field(sensor, item, fact.path_in(item.frame)))
     return {role: text for role, text in texts.items() if text}
 
 
-def _reports(sensor: Sensor, fact: Reported, item: Found) -> bool:
+def _is_fact_in_frame(sensor: Sensor, fact: Reported, item: Found) -> bool:
     """Return whether a frame reports a fact, such as the model name."""
     if not fact.path_in(item.frame):
         return False
-    return bool(find_reporting(sensor, fact, item.frame, pack_found([item]))[0])
+    return bool(find_reporting_frames(sensor, fact, item.frame, pack_found([item]))[0])
 
 
-def find_reporting(
+def find_reporting_frames(
     sensor: SensorDescription, fact: Reported, name: str, frames: Frames
 ) -> NDArray[np.bool_]:
     """Return a mask (n,) of the frames that report a fact, such as the model name."""
@@ -348,7 +350,10 @@ def _describe_fact(fact: Reported, value: Any, info: FieldInfo) -> str:
 
 
 def _read_field(sensor: Sensor, item: Found, path: str) -> tuple[Any, FieldInfo]:
-    """Return the raw value and the description of a field; "" if it is missing."""
+    """Return the raw value and the description of a field.
+
+    The raw value is "" if the frame has no part that contains the field.
+    """
     fields = make_schema(sensor.frames[item.frame].tree)
     parsed = sensor.parse(item.data, item.frame)
     axis, _, rest = fields.split_part_path(path) or ("", "", path)
@@ -399,8 +404,10 @@ class Verdict:
     """The sensors that may have sent some bytes.
 
     Attributes:
-        scores: all sensors that fit, best first.
-        candidates: the sensors that may have sent the bytes.
+        scores: all sensors with many valid frames in the bytes: first the candidates, then the
+            sensors that were ruled out.
+        candidates: the sensors that may have sent the bytes; more than one if nothing
+            distinguishes them.
         others: the models that are not installed, but may have sent the bytes: id -> difference
             from the installed models.
         fault: a message if frames of a sensor have wrong checksums; else "".
@@ -475,23 +482,29 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
     length = len(frames[0])
     covered = sum(last - first for first, last in match.span.ranges(match.place, length))
     return (
-        f"{text}. The checksum {match.algorithm.describe()} matches {match.place} in"
-        f" {match.right} of {match.total} frames, over {covered} of {length} bytes"
+        f"{text}. In {match.right} of {match.total} frames, the checksum field ({match.place})"
+        f" contains {match.algorithm.describe()}, computed over {covered} of {length} bytes"
         f" ({match.span.describe(match.place, length)})"
     )
 
 
 def _read_stored_checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64]:
-    """Return the checksums in the frames, (n,)."""
+    """Return the checksums that frames contain, (n,), so that all checksums are accepted.
+
+    Args:
+        seal: the checksum as the struct of the frame declares it.
+        rows: the bytes of the frames, one row per frame.
+    """
     return seal.load_stored(rows)
 
 
 def _score_each(
     candidates: Sequence[Sensor], rate: Callable[[Sensor], Score | None]
 ) -> list[Score]:
-    """Return the scores of the sensors that fit.
+    """Return the scores of the sensors for which `rate` returns a score.
 
-    A sensor with a faulty description is ignored with a warning.
+    Sensors with the same frames are rated only once. A sensor with a faulty description is ignored
+    with a warning.
     """
     shared: dict[object, Score | None] = {}  # key: identity of the frames, and id of the sensor
     for sensor in candidates:
@@ -837,7 +850,10 @@ def _has_prefix(codec: Codec, data: bytes) -> bool:
 
 
 def _begins_like_frame(fault: WireError) -> bool:
-    """Return whether invalid bytes begin with the constant bits of a frame type."""
+    """Return whether the bytes of an error resemble a frame, although they are invalid.
+
+    They must have the constants of the frame type, with at least `MIN_CONSTANT_BITS` bits.
+    """
     if not fault.frame:
         return False
     prefix = get_codec(sensors()[fault.sensor].frames[fault.frame]).prefix

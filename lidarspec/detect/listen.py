@@ -144,7 +144,7 @@ def _read_sample(source: str, seconds: float, baud: int | None, name: str) -> It
         if isinstance(opened, LiveTransport):
             chunks = _read_chunks(opened, seconds)
             if not chunks:
-                warnings = _warn_of_other_senders(opened)
+                warnings = _make_sender_warnings(opened)
         else:
             chunks = read_beginning(opened, MAX_SAMPLE_BYTES, max_chunks=max_chunks)
             warnings = tuple(opened.warnings)
@@ -153,8 +153,8 @@ def _read_sample(source: str, seconds: float, baud: int | None, name: str) -> It
     )
 
 
-def _warn_of_other_senders(opened: LiveTransport) -> tuple[str, ...]:
-    """Return warnings if only other senders have sent datagrams."""
+def _make_sender_warnings(opened: LiveTransport) -> tuple[str, ...]:
+    """Return a warning if datagrams came, but none from the requested sender."""
     if opened.other_sender is None:
         return ()
     example = endpoint(opened.other_sender)

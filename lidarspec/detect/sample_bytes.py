@@ -73,7 +73,7 @@ def read_beginning(opened: Transport, enough: int, *, max_chunks: int | None = N
 
 
 def take_leading(chunks: Iterable[Chunk], enough: int) -> list[Chunk]:
-    """Return the first chunks, until they have at least `enough` bytes."""
+    """Return the first chunks: as many as contain `enough` bytes together, or all."""
     taken = list[Chunk]()
     size = 0
     for chunk in chunks:

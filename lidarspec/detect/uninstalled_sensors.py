@@ -33,7 +33,10 @@ MAX_LISTED_SENSORS = 6
 
 
 def make_signatures(sensor: Sensor) -> tuple[Signature, ...]:
-    """Return the signatures of data frames that have `MIN_SYNC_BYTES` constant bytes."""
+    """Return the signatures of a sensor's data frames.
+
+    A frame type with fewer than `MIN_SYNC_BYTES` constant bytes at its start has no signature.
+    """
     signatures = []
     for name in sensor.main_frames:
         engine = get_codec(sensor.frames[name])
@@ -63,7 +66,7 @@ def _format_sync(constant: dict[int, int]) -> str:
 def recognize(sample: SampleBytes) -> list[KnownSensor]:
     """Return the known sensors without a plugin that may have sent the bytes.
 
-    If no frame matches, returns the sensors with the same destination port.
+    If no frame matches, returns the sensors that send to a destination port of the sample.
     """
     installed = set(registry().names())
     missing = [row for row in known_sensors() if row.id not in installed]
@@ -147,15 +150,18 @@ def describe(sensors: Sequence[KnownSensor]) -> str:
 
 
 def suggest_installation(error: WireError, sample: SampleBytes) -> WireError:
-    """Add a note with the distributions to install to an error about unknown bytes."""
+    """Name the distributions to install in an error about unknown bytes; return the error.
+
+    The error is not changed if no known sensor may have sent the bytes.
+    """
     missing = recognize(sample)
     if missing:
         error.add_note(describe(missing))
-        suggest(error, install_commands(missing))
+        suggest(error, make_install_command(missing))
     return error
 
 
-def install_commands(sensors: Sequence[KnownSensor]) -> str:
+def make_install_command(sensors: Sequence[KnownSensor]) -> str:
     """Return the command that installs the distributions of the sensors."""
     return install_command(*_list_distributions(sensors))
 

@@ -86,7 +86,7 @@ class AsyncDevice:
             yield packets
 
     async def scans(self, *, select: Selection = EVERYTHING) -> AsyncIterator[Scan]:
-        """Yield scans from the start of the source; see `Device.scans`."""
+        """Yield scans; see `Device.scans`."""
         sieve = self.device.make_selector(select)
         async for scan in self._fetch(self._get_iterator("scans")):
             wanted = sieve.select(scan)
@@ -214,7 +214,10 @@ async def _run_in_thread(executor: ThreadPoolExecutor, function: Callable[[], T]
 
 
 async def _await_result(future: asyncio.Future[T]) -> T:
-    """Return the result of a future; delay a cancellation until it is done."""
+    """Return the result of a future.
+
+    If the waiting task is cancelled, CancelledError is raised only after the future is done.
+    """
     try:
         return await asyncio.shield(future)
     except asyncio.CancelledError:

@@ -32,7 +32,7 @@ POLICIES = ("drop_oldest", "block")
 
 
 class LinkEvent(Enum):
-    """An event on a link, other than arriving data."""
+    """A change of a link: it became silent, was lost, or is back."""
 
     SILENT = "silent"
     LOST = "lost"
@@ -44,7 +44,7 @@ Event = tuple[str, Item]
 
 
 class BoundedQueue:
-    """A queue of chunks and other events from the links of a device.
+    """A queue of events from the links of a device: chunks, link events and errors.
 
     Args:
         policy: what a full queue does: "drop_oldest" or "block".
@@ -93,7 +93,7 @@ class BoundedQueue:
             self._changed.notify_all()
 
     def take(
-        self, timeout: float, *, until: float = 0.0, chunks: int = MAX_QUEUED_CHUNKS
+        self, timeout: float, *, until: float = 0.0, max_events: int = MAX_QUEUED_CHUNKS
     ) -> list[Event]:
         """Remove events from the queue and return them; wait if it is empty.
 
@@ -101,7 +101,7 @@ class BoundedQueue:
             timeout: maximum time to wait, in seconds. If no event arrives in time, the result is
                 empty.
             until: a time of `time.monotonic` until which events are collected.
-            chunks: maximum number of events.
+            max_events: maximum number of events.
         """
         pause = min(until - time.monotonic(), timeout)
         if pause > 0 and not self.closed:
@@ -112,12 +112,12 @@ class BoundedQueue:
             )
             events = list(self._kept_events)
             self._kept_events.clear()
-            if len(events) + len(self._events) <= chunks and not self._links_with_gap:
+            if len(events) + len(self._events) <= max_events and not self._links_with_gap:
                 events += self._events
                 self._events.clear()
                 self.consumed += self._waiting
                 self._waiting = self._size = 0
-            while self._events and len(events) < chunks:
+            while self._events and len(events) < max_events:
                 events.append(self._take_oldest())
             self._changed.notify_all()
             return events
@@ -204,7 +204,8 @@ class CaptureThread:
     def record(self, log: TrafficLog | None) -> None:
         """Start or replace the recording.
 
-        Events in the queue are discarded, so that all later events are in the recording.
+        Events that are already in the queue are discarded, because they are not in the new
+        recording. After this call, the consumer gets only recorded events.
 
         Args:
             log: the new recording; None to stop recording.

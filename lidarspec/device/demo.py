@@ -167,6 +167,7 @@ def _read(
 
 
 def _free_port() -> int:
+    """Return a UDP port that is not in use."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind((LOCALHOST, 0))
         return int(probe.getsockname()[1])

@@ -56,8 +56,9 @@ class Device(ClosingContext):
     Attributes:
         source: the SOURCE.
         sensor: the sensor, given or detected.
-        mount: the pose of the sensor from `lidarspec.toml`; None if the file has none. With a
-            mount, scans are in the axes of the carrier, and packets in the axes of the sensor.
+        mount: the pose of the sensor on its carrier, such as a vehicle, from `lidarspec.toml`; None
+            if the file has none. With a mount, scans are in the axes of the carrier, and packets in
+            the axes of the sensor.
         imu_samples: the IMU samples that arrived with the last batch of `packets`, in the axes of
             the carrier for a sensor with a mount.
     """
@@ -147,7 +148,7 @@ class Device(ClosingContext):
 
     @property
     def learned(self) -> Mapping[str, Any]:
-        """The options that the sensor reported when it was opened."""
+        """The values of options that the sensor reported when the device was opened."""
         return self._input.learned
 
     @property
@@ -174,7 +175,7 @@ class Device(ClosingContext):
 
     @property
     def progress(self) -> tuple[int, int] | None:
-        """The number of bytes read from a file, and its size; None if unknown.
+        """(number of bytes read, size) of a file; None for a pipe or a live source.
 
         For a compressed file, both count compressed bytes.
         """
@@ -188,8 +189,8 @@ class Device(ClosingContext):
     def packets(self, frame: str | None = None, *, wait: float | None = None) -> Iterator[Packets]:
         """Yield packets in batches, until the input ends or the device is closed.
 
-        A file is read only once: all iterators share one position in it. After `latest`, a new
-        iterator begins with the batch that contains the end of the returned scan.
+        A file is read only once: all iterators share one position in it. In a file, an iterator
+        after `latest` begins with the batch of packets in which the returned scan ends.
 
         Args:
             frame: the name of a frame type; by default the data frame.
@@ -259,11 +260,11 @@ class Device(ClosingContext):
         """Yield scans, until the input ends or the device is closed.
 
         The first and the last scan, and the scans before and after an interruption, have
-        ``complete=False``. A scan whose end is missing is yielded after twice the longest duration
-        of a revolution, with a warning.
+        ``complete=False``. If the end of a scan is missing, the scan is cut when it lasts twice as
+        long as the slowest revolution of the sensor, with a warning.
 
-        A file is read only once: all iterators share one position in it. After `latest`, a new
-        iterator begins with the batch that contains the end of the returned scan.
+        A file is read only once: all iterators share one position in it. In a file, an iterator
+        after `latest` begins with the packets of the batch in which the returned scan ends.
 
         Args:
             wait: if no scan arrives for this number of seconds, yield None.
@@ -336,7 +337,10 @@ class Device(ClosingContext):
                 raise self.make_timeout_error()
 
     def newest(self, wait: float) -> Scan | None:
-        """Return the newest whole scan; None if no new scan arrives within `wait` seconds.
+        """Return the newest whole scan like `latest`, or None if none arrives in time.
+
+        Args:
+            wait: seconds to wait.
 
         Raises:
             SourceError: if the input has ended or the device was closed.
@@ -406,8 +410,9 @@ class Device(ClosingContext):
     def read_ahead(self, size: int) -> None:
         """Set how many bytes of a file are read and decoded at a time.
 
-        A viewer that shows a file at its recorded speed sets a small size, because counters include
-        everything that was read. For a live source, this method has no effect.
+        The counters include all bytes that were read. So a viewer that shows a file at its recorded
+        speed sets a small size, to show counters that fit the picture. For a live source, this
+        method has no effect.
 
         Args:
             size: the number of bytes; 0, the default, for the fastest size.

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.captures.bulk import CapturedDatagrams
-from lidarspec.detect.identification import find_reporting, read_info
+from lidarspec.detect.identification import find_reporting_frames, read_info
 from lidarspec.device.first_frames import FirstFrames, find_first_frames, needs_first_frames
 from lidarspec.device.sender_filter import SenderCheck, frame_senders
 from lidarspec.device.session import Reply
@@ -80,7 +80,7 @@ class DeviceInput(Protocol):
         """Store the last frame of one type that reports a fact, such as the serial number."""
         rows = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
         if fact.where is not None:
-            rows = rows[find_reporting(self.sensor, fact, name, frames.select(rows))]
+            rows = rows[find_reporting_frames(self.sensor, fact, name, frames.select(rows))]
         for item in frames.select(rows[-1:]).to_found():
             if not self._lacks_values(role, item):
                 self.info_frames = {**self.info_frames, role: item}

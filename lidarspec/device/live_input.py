@@ -387,7 +387,7 @@ class LiveInput(DeviceInput):
         else:
             left = (deadline - self._clock.now()) / 1e9
         wait = wait if left < -MAX_PUMP_S else min(wait, max(left, 0.0))
-        events = self.queue.take(wait, until=self._decode_due_s, chunks=MAX_CHUNKS)
+        events = self.queue.take(wait, until=self._decode_due_s, max_events=MAX_CHUNKS)
         if events:
             self._decode_due_s = time.monotonic() + self._period
         for link, item in _join_chunks(events):

@@ -54,9 +54,9 @@ def test_files(tmp_path: Path, words: tuple[str, ...], monkeypatch: pytest.Monke
     Path("raw.bin").write_bytes(b"".join(FRAMES))
     Path("cut.bin").write_bytes(FRAMES[0][-5:] + b"".join(FRAMES[1:]))
     text = ran("crc", *words).stdout
-    assert f"  paste: {PASTE}" in text.splitlines()
-    assert "  field: the last byte" in text.splitlines()
-    assert "  over:  all other bytes" in text.splitlines()
+    assert f"  paste:  {PASTE}" in text.splitlines()
+    assert "  field:  the last byte" in text.splitlines()
+    assert "  covers: all other bytes" in text.splitlines()
     assert text.count("paste:") == 1
 
 

@@ -108,7 +108,7 @@ class TestQueue:
         producer.start()
         found: list[int] = []
         while not queue.closed or len(queue):
-            for _, item in queue.take(0.5, chunks=source.choice([1, 7, 500])):
+            for _, item in queue.take(0.5, max_events=source.choice([1, 7, 500])):
                 assert isinstance(item, Chunk)
                 found.append(int.from_bytes(item.data[:8], "little"))
             assert len(queue) <= 50
