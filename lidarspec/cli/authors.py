@@ -185,7 +185,7 @@ def check(
 ) -> None:
     """Run the checks of the test kit on a sensor, a file or a distribution.
 
-    No test file is needed. The exit code is 1 if a check fails.
+    You need not write any test for this. The exit code is 1 if a check fails.
     """
     import_library("hypothesis", "testing")
     file = Path(vectors) if vectors else None

@@ -114,7 +114,7 @@ def send(
 
     No stop command is sent, so a sensor that was started keeps running. A value without a unit, as
     in rate=10, is in the unit that `show` prints. A value with another unit, as in rate=600rpm, is
-    converted. If a sensor sends nothing until it is started, name it with -s.
+    converted. A sensor that sends nothing until it is started cannot be detected: name it with -s.
     """
     if (command is None) == (digits is None):
         raise UsageError("send requires the name of a command, or bytes such as --hex 'a5 50'")

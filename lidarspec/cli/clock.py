@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.inputs import FirstFrameTimeout, conclude, no_scan_error
+from lidarspec.cli.inputs import FirstFrameTimeout, no_scan_error, report_outcome
 from lidarspec.cli.options import DURATION, sensor_option
 from lidarspec.cli.terminal import say
 from lidarspec.detect.doctor import Diagnosis
@@ -100,7 +100,7 @@ def clock(
     max_drift: float,
     as_json: bool,
 ) -> None:
-    """Diagnose the clocks of sensors: source of time, lock, offset, drift, jumps.
+    """Diagnose sensor clocks: time source, synchronization, offset, drift, jumps.
 
     The times in the packets are compared with their arrival times. Arrival times are measured by
     the clock of this computer, or of the computer that recorded the file. Several sources are read
@@ -121,16 +121,18 @@ def clock(
         for source_clock, report in zip(clocks, reports, strict=True):
             _print_report(source_clock, report, reports[0], as_json=as_json)
         for source_clock in clocks:
-            conclude(source_clock.device)
+            report_outcome(source_clock.device)
     if any(finding.is_fault for report in reports for finding in report.findings):
         raise click.exceptions.Exit(FINDINGS)
 
 
 def diagnose_clock(source: str, sensor_id: str | Sensor | None, seconds: float) -> Diagnosis | None:
-    """Return the finding of `doctor` about the clock of a source with valid data.
+    """Open a source again, and return the finding of `doctor` about its clock.
+
+    `doctor` calls this function after it has received valid data from the source.
 
     Returns:
-        None if the sensor sends no time, or cannot be opened again.
+        None if the sensor sends no time, or if the source cannot be opened or read.
     """
     try:
         with open_device(source, sensor_id, start=False, period=LOOK_S) as device:

@@ -101,7 +101,10 @@ def _complete_sensors(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _complete_sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """Return devices, ports, simulated sensors, and the files that begin with a text."""
+    """Return devices, ports, simulated sensors, and files that begin with `incomplete`.
+
+    If only files begin with it, returns an empty list: the shell then completes file names.
+    """
     if incomplete.startswith("sim:"):
         simulated = [f"sim:{name}" for name in registry().names()]
     else:

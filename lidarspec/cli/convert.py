@@ -18,12 +18,12 @@ import numpy as np
 from lidarspec import batch
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.inputs import (
-    conclude,
     identify_file,
     iter_device_scans,
-    nearest_fault_error,
     no_frame_error,
+    no_sensor_error,
     refuse_overwriting,
+    report_outcome,
     reread,
 )
 from lidarspec.cli.options import (
@@ -71,7 +71,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.open_url import is_live, open_transport
 from lidarspec.transports.protocol import Chunk, no_bytes_message
 
-#: How many types of parts a remark lists.
+#: The maximum number of kinds of parts that a remark lists.
 MAX_LISTED_PARTS = 3
 #: The suffixes of files with packets. In `convert`, `.bin` is a file with points, as in KITTI.
 _PACKET_SUFFIXES = tuple(suffix for suffix in SUFFIXES if suffix != ".bin")
@@ -129,7 +129,8 @@ class _Counts:
     "--frame",
     metavar="NAME",
     help="Write the fields of this frame type, one row per frame, instead of the points."
-    " FRAME.PARTS.KIND writes the parts of one kind, one row per part.",
+    " If a field contains elements of several kinds, FRAME.FIELD.KIND writes one row per element of"
+    " this kind.",
 )
 @click.option(
     "--force", is_flag=True, help="Overwrite OUT; with --to, also convert finished files again."
@@ -180,9 +181,9 @@ def convert(
     The suffix of OUT selects the format. .csv and .npz contain all columns of the sensor, such as
     x, y, z, range, azimuth, elevation, intensity, time, ring, return_index and column, and the
     number of the scan. Units are metres, radians, and seconds since the scan's stamp. .npy, .ply,
-    .pcd and the compressed .lzf.pcd contain x, y, z, intensity, ring, time and further columns of
-    the sensor. If several scans share a file, they also contain the number of the scan. .bin
-    contains x, y, z and intensity, as in KITTI. .xyz contains x, y and z.
+    .pcd and the compressed .lzf.pcd contain x, y, z, intensity, ring, time and the sensor's own
+    columns, such as velocity. These files also contain the number of the scan if several scans
+    share a file. .bin contains x, y, z and intensity, as in KITTI. .xyz contains x, y and z.
 
     If OUT contains a number format, as in scans/%05d.pcd, each scan is written to a file of its
     own. With %F, %H, %M or %S in OUT, all scans of one date, hour, minute or second share a file.
@@ -245,7 +246,9 @@ def convert(
     source = sources[0]
     if Path(target).suffix.lower() in _PACKET_SUFFIXES:
         if count or is_imu or frame or chooses_scans:
-            raise UsageError(f"{target} contains packets, which can be selected only by --slice")
+            raise UsageError(
+                f"packets are written to {target}, and they can be selected only by --slice"
+            )
         refuse_overwriting([target], source, sensor_id, force=force)
         _write_packets(source, target, sensor_id, selection.times, as_json=as_json)
         return
@@ -282,7 +285,7 @@ def convert(
             emit_json(
                 {"sensor": device.sensor.id, "output": target, **summary, "stats": stats}, None
             )
-        conclude(device)
+        report_outcome(device)
 
 
 def _write_imu(
@@ -314,15 +317,16 @@ def _iter_imu(device: Device, selection: Selection) -> Generator[ImuSamples]:
         for selected in batches:
             for packets in selected.values():
                 if selection.time == "sensor":
-                    _require_same_time(packets, frames_by_clock)
+                    _refuse_mixed_clocks(packets, frames_by_clock)
                 samples = read_imu(packets)
                 yield samples if device.mount is None else samples.turn(device.mount.rotation)
 
 
-def _require_same_time(packets: Packets, frames_by_clock: dict[bool, str]) -> None:
-    """Raise UsageError if some frame types have a clock and others have none.
+def _refuse_mixed_clocks(packets: Packets, frames_by_clock: dict[bool, str]) -> None:
+    """Raise UsageError if only some of the frame types so far have a clock.
 
     Args:
+        packets: the next packets to check.
         frames_by_clock: True -> a frame type with a clock, False -> a frame type without a clock.
             This function adds the type of `packets`.
     """
@@ -340,8 +344,9 @@ def _choose_frames(device: Device, target: str, frame: str | None) -> Sequence[s
     """Return the frame types to write.
 
     Args:
-        frame: the requested frame type, such as "report", or type of parts, such as
-            "report.tags.temperature"; None for all frame types that the sensor sends.
+        frame: the requested frame type, such as "report", or one kind of the parts (elements of
+            several kinds) in a field of a frame, such as "report.tags.temperature"; None for all
+            frame types that the sensor sends.
     """
     sensor = device.sensor
     frames = sensor.incoming
@@ -396,7 +401,7 @@ def _write_frames(
 
 
 def _list_parts(sensor: Sensor, frame: str) -> list[str]:
-    """Return the types of parts in a frame type, for example "report.tags.temperature"."""
+    """Return the kinds of parts in a frame type, for example "report.tags.temperature"."""
     schema = get_codec(sensor.frames[frame]).schema
     return [f"{frame}.{path}" for path in schema.part_kinds]
 
@@ -437,7 +442,7 @@ def _take_types(packets: Packets, types: Sequence[str]) -> dict[str, Packets]:
     """Return the packets of the requested types, by type, without empty packets.
 
     Args:
-        types: the requested frame types, and types of parts such as "report.tags.temperature".
+        types: the requested frame types, and kinds of parts such as "report.tags.temperature".
     """
     found = dict[str, Packets]()
     for name in types:
@@ -515,7 +520,7 @@ def _write_points(
     note(f"{counts} of {device.sensor.id}; {device.stats}")
     if counts.units:
         columns = [f"{name} [{unit}]" if unit else name for name, unit in counts.units.items()]
-        note(f"further columns: {', '.join(columns)}")
+        note(f"{device.sensor.id} has further columns: {', '.join(columns)}")
     return {"scans": counts.scans, "points": counts.points, "units": dict(counts.units)}
 
 
@@ -598,7 +603,7 @@ def _detect_sensor(source: str, target: str) -> Sensor:
         raise suggest(error, f"lidarspec convert {quote(source)} {quote(target)} -s ID") from None
     except WireError as error:
         sample = None if suggestion(error) else reread(source)
-        raise error if sample is None else nearest_fault_error(sample) from None
+        raise error if sample is None else no_sensor_error(sample) from None
 
 
 def _make_no_data_error(device: Device, target: str, content: str = "") -> Exception:

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.inputs import nearest_fault_error, no_frame_error, open_input
+from lidarspec.cli.inputs import no_frame_error, no_sensor_error, open_input
 from lidarspec.cli.listing import emit_lines
 from lidarspec.cli.options import OFFSET, count_option, selection_options, sensor_option
 from lidarspec.cli.output import emit_json, emit_json_list, emit_parts, output_options, table
@@ -43,7 +43,7 @@ def parse(
     as_json: bool,
     output: str | None,
 ) -> None:
-    """Print the fields of each frame in hexadecimal text or a file.
+    """Read frames from hexadecimal text or a file, and print their fields.
 
     --slice selects by arrival time. Offsets are then relative to the beginning of the slice.
     """
@@ -164,7 +164,7 @@ def explain(
             "--at and --bytes cannot be combined: use --at for one byte, or --bytes for a range"
         )
     with open_input(words, selection.times) as (sample, chunks):
-        sensor, fits = _find_sensor(sample, sensor_id, damaged=True)
+        sensor, fits = _find_sensor(sample, sensor_id, allow_similar=True)
         if not sample.data:
             raise no_frame_error(sensor, sample)
         pieces = iter_pieces(sensor, chunks, datagrams=sample.datagrams, frame=frame)
@@ -178,7 +178,7 @@ def explain(
             emit_json_list({"sensor": sensor.id, "fits": fits}, "frames", listed, output)
         else:
             emit_lines(listing(sensor, parts, at, every=bits, verdicts=bad), output)
-        wanted.conclude(sample)
+        wanted.report_outcome(sample)
 
 
 def listing(
@@ -192,9 +192,10 @@ def listing(
     """Yield the lines of explained pieces of the input; each piece has a title.
 
     Args:
+        parts: pairs of a piece and its explanation.
         at: the offset of a byte; the title names the field at this offset.
         every: whether to draw the bits of all elements of an array, instead of the first element.
-        verdicts: whether to add the damage of each piece to its title.
+        verdicts: whether the title of a damaged piece describes the damage.
     """
     for index, (piece, part) in enumerate(parts):
         yield from [()] * bool(index)
@@ -265,7 +266,7 @@ class FrameSelection:
         self.valid = self.damaged = self.unframed = self.others = 0
 
     def iter_valid(self, pieces: Iterable[InputPiece]) -> Iterator[InputPiece]:
-        """Yield the valid frames."""
+        """Yield the valid frames, and count the bytes outside them."""
         for piece in pieces:
             if piece.is_valid:
                 self.valid += 1
@@ -298,6 +299,7 @@ class FrameSelection:
         self._ended = True
 
     def _iter_within(self, piece: InputPiece) -> Iterator[tuple[InputPiece, Explanation]]:
+        """Yield the selected parts of a piece with their explanations, and count them."""
         try:
             for part, what in explain_piece(self._sensor, piece, self._frame):
                 if self._bad and what.is_filler:
@@ -318,7 +320,7 @@ class FrameSelection:
         except WireError as fault:
             raise suggest(fault, f"lidarspec show {self._sensor.id}") from None
 
-    def conclude(self, sample: SampleBytes) -> None:
+    def report_outcome(self, sample: SampleBytes) -> None:
         """Print the numbers of frames and other bytes, at the end of the input.
 
         Raises:
@@ -433,13 +435,14 @@ def _compare(
 
 
 def _find_sensor(
-    sample: SampleBytes, sensor_id: str | Sensor | None, *, damaged: bool = False
+    sample: SampleBytes, sensor_id: str | Sensor | None, *, allow_similar: bool = False
 ) -> tuple[Sensor, list[str]]:
-    """Return the named sensor, or the first of the sensors that fit some bytes.
+    """Return the named sensor, or the sensor that fits some bytes best.
 
     Args:
         sensor_id: the named sensor; None to find a sensor.
-        damaged: whether to return the most similar sensor if the bytes contain no valid frame.
+        allow_similar: whether to return the most similar sensor if the bytes contain no valid
+            frame, instead of raising an error.
 
     Returns:
         The sensor, and the ids of all sensors that fit; no ids for a named sensor.
@@ -457,8 +460,8 @@ def _find_sensor(
             + (f", or of {', '.join(fits[1:])}; choose with -s" if fits[1:] else "")
         )
         return sensors[0], fits
-    fault = nearest_fault_error(sample)
-    if not damaged or not fault.sensor:
+    fault = no_sensor_error(sample)
+    if not allow_similar or not fault.sensor:
         raise fault
     note(f"these bytes contain no valid frame; they are most similar to {fault.sensor}")
     return named_sensor(fault.sensor), []

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 MAX_REPEATED_CHARS = 400
 #: Maximum length of other input to quote in a message.
 MAX_QUOTED_CHARS = 64
-#: Maximum number of bytes that `read` returns.
+#: The number of bytes after which `read_sample` stops reading.
 MAX_INPUT_BYTES = 1 << 20
 #: Maximum time to wait for the first frame of a device, in seconds.
 FIRST_FRAME_TIMEOUT_S = 10.0
@@ -70,7 +70,8 @@ def open_input(
     """Open the input that command-line arguments name.
 
     Yields:
-        The first bytes of the input, and an iterator over all its chunks, which reads lazily.
+        The first bytes of the input; and an iterator over the chunks of the whole input, from its
+        start, which reads them when they are needed.
 
     Args:
         words: the arguments: hexadecimal text, "-", a file name, or a device of lidarspec.toml.
@@ -165,8 +166,10 @@ def _iter_standard_input(file: FileTransport) -> Iterator[Chunk]:
     yield from iter_hex_chunks("standard input", readline)
 
 
-def read(words: Sequence[str]) -> SampleBytes:
+def read_sample(words: Sequence[str]) -> SampleBytes:
     """Return the first bytes of the input that command-line arguments name.
+
+    Reading stops after `MAX_INPUT_BYTES`.
 
     Raises:
         UsageError: for text that is neither hexadecimal nor a file.
@@ -202,7 +205,8 @@ def refuse_overwriting(
 
     Args:
         target: the output file or files.
-        inputs: SOURCEs, file names, and sensors whose options may be file names.
+        inputs: SOURCEs, names of input files, and sensors, because the options of a sensor may name
+            input files.
         force: whether the verb may overwrite existing files. Inputs are never overwritten.
 
     Raises:
@@ -233,7 +237,7 @@ def refuse_overwriting(
 
 
 def _iter_read_files(argument: str | Path | Sensor | None) -> Iterator[str | int]:
-    """Yield the files that an argument of a verb may name; 0 for standard input."""
+    """Yield the possible names of an argument's files; descriptor 0 for standard input."""
     if isinstance(argument, Sensor):
         yield from (
             str(value) for value in argument.options.values() if isinstance(value, str | Path)
@@ -277,15 +281,20 @@ def no_frame_error(sensor: Sensor, sample: SampleBytes) -> WireError:
         )
         return suggest(error, "lidarspec sensors")
     try:
-        identify(sensor, data)
+        name = identify(sensor, data)
     except WireError as error:
         return suggest(error, command)
     return suggest(
-        WireError("the values of the frame are not plausible", sensor=sensor.id, data=data), command
+        WireError(
+            f"these bytes are a {name} frame, but its values are not plausible",
+            sensor=sensor.id,
+            data=data,
+        ),
+        command,
     )
 
 
-def nearest_fault_error(sample: SampleBytes) -> WireError:
+def no_sensor_error(sample: SampleBytes) -> WireError:
     """Return the error for an input that no sensor fits."""
     from lidarspec.detect.identification import find_nearest_fault
     from lidarspec.detect.uninstalled_sensors import suggest_installation
@@ -364,8 +373,8 @@ def no_scan_error(device: Device, source: str, seconds: float | None = None) -> 
     return suggest(error, f"lidarspec detect {quote(source)}")
 
 
-def conclude(device: Device) -> None:
-    """Print values that the sensor reported, and warnings, after reading a source.
+def report_outcome(device: Device) -> None:
+    """Print the options that the sensor reported, and the warnings, after reading a source.
 
     Raises:
         PluginError: if the plugin raised an exception for some packets.

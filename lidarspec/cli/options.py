@@ -27,7 +27,8 @@ def sensor_option(function: Function) -> Function:
 def configuration_options(function: Function) -> Function:
     """Add ``-O`` and ``--calibration``, which configure the sensor.
 
-    The verb gets the configured sensor as `sensor_id`, or the id if no option is given.
+    The argument `sensor_id` of the verb is the configured `Sensor`, or only the id of the sensor if
+    none of these options is given.
     """
 
     @functools.wraps(function)

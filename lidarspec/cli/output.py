@@ -65,7 +65,7 @@ def output_option(function: Function) -> Function:
 
 
 class Progress(contextlib.AbstractContextManager["Progress"]):
-    """A progress line on standard error; a context manager that removes it at its end.
+    """A progress line on standard error, which is removed when the context ends.
 
     Args:
         unit: converts an amount of work to text.
@@ -105,14 +105,15 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         self._bar.start()
         self._bar.refresh()
 
-    def show_progress(self, remarks: Iterable[str], text: Callable[[], str]) -> None:
+    def run_task(self, task: Iterable[str], text: Callable[[], str]) -> None:
         """Run a task, print its remarks, and show progress while it runs.
 
         Args:
-            remarks: an iterator that runs the task. It yields texts to print; an empty text only
-                updates the progress.
+            task: an iterator that does the work step by step. It yields remarks to print; an empty
+                remark only updates the progress.
+            text: returns the text of the progress line.
         """
-        for remark in remarks:
+        for remark in task:
             self(text)
             if remark:
                 self.note(remark)
@@ -229,10 +230,12 @@ def emit_json(value: Any, output: str | None) -> None:
 def emit_json_list(
     head: dict[str, Any], name: str, items: Iterable[Any], output: str | None
 ) -> None:
-    """Write a JSON object with a list, whose items are written as the iterator yields them.
+    """Write a JSON object that ends with a list, without storing the list.
 
     Args:
+        head: the entries of the object before the list.
         name: the key of the list.
+        items: yields the items of the list, which are written one after another.
         output: the file; None for standard output.
     """
     beginning = json.dumps({**head, name: []}, indent=2, allow_nan=False).removesuffix("]\n}")
@@ -278,7 +281,10 @@ def _fit_widths(lines: Sequence[Sequence[str]], room: int) -> list[int]:
 
 
 def _fold_row(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator[str]:
-    """Yield the lines of one row, and the lines of the cells that have no width."""
+    """Yield the lines of one row.
+
+    The cells after the last width follow the row, each on indented lines of its own.
+    """
 
     def wrap(cell: str, width: int) -> list[str]:
         if len(cell) > width:

@@ -13,10 +13,10 @@ import click
 
 from lidarspec.cli.inputs import (
     FIRST_FRAME_TIMEOUT_S,
-    conclude,
     iter_device_scans,
     no_scan_error,
     refuse_overwriting,
+    report_outcome,
     require_points,
 )
 from lidarspec.cli.options import DURATION, colour_option, selection_options, sensor_option
@@ -85,7 +85,7 @@ def plot(
     ramp: str,
     max_range: float | None,
 ) -> None:
-    """Draw a scan, or intensities, ranges and rates over time.
+    """Draw a scan, a histogram of intensities, or ranges or rates over time.
 
     A scan is drawn to scale from above, and also from the side if the points are not in one plane.
     --kind intensity draws a histogram of the intensities. --kind ranges draws the number of returns
@@ -105,7 +105,7 @@ def plot(
         require_points(device, source)
         if kind == "scan":
             scan = _find_scan(device, source, selection, number)
-            conclude(device)  # before drawing, during which a live source continues
+            report_outcome(device)  # before drawing, during which a live source continues
             title = f"{device.sensor.id}: {scan}"
             _draw_scan(scan, title, ramp, max_range, output, suffix)
         else:
@@ -162,7 +162,7 @@ def _draw_over_time(
     title = f"{device.sensor.id}, {Path(source).name if device.progress else source}"
     if kind == "rates":
         rates = matplotlib_figures.RateSeries(LiveScans(device, select=selection), end_s)
-        conclude(device)
+        report_outcome(device)
         return matplotlib_figures.draw_rates(rates, title)
     scans = iter_device_scans(device, source, selection, until=end_s)
     first = next(scans, None)
@@ -172,7 +172,7 @@ def _draw_over_time(
     def iter_scans() -> Iterator[Scan]:
         yield first
         yield from scans
-        conclude(device)
+        report_outcome(device)
 
     if kind == "ranges":
         return matplotlib_figures.draw_ranges(iter_scans(), title)

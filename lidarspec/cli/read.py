@@ -17,9 +17,9 @@ import numpy as np
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.inputs import (
     FirstFrameTimeout,
-    conclude,
     iter_device_scans,
     no_scan_error,
+    report_outcome,
     require_points,
 )
 from lidarspec.cli.options import (
@@ -124,7 +124,7 @@ def read(
             printed += 1
         if not printed and not device.stats.frames:
             raise no_scan_error(device, source, duration)
-        conclude(device)
+        report_outcome(device)
 
 
 def _iter_lines(rows: Iterable[tuple[Units, Row]], *, as_json: bool) -> Iterator[str]:
@@ -378,11 +378,12 @@ def stats(
     max_errors: float | None,
     as_json: bool,
 ) -> None:
-    """Print speed, rates, errors, loss, jitter and queue of a sensor.
+    """Print scan rate, packet rate, errors, loss, jitter and queue of a sensor.
 
-    A line is printed for each interval, and a summary at the end. Errors are frames with a wrong
-    checksum, length or value. Loss is the share of missing packets, computed from the packet
-    counter or the clock of the sensor. A file is read as fast as possible, in batches. Its
+    A line is printed for each interval, and a summary at the end. Speed is the number of scans per
+    second. Queue is the number of reads or datagrams that wait to be decoded. Errors are frames
+    with a wrong checksum, length or value. Loss is the share of missing packets, computed from the
+    packet counter or the clock of the sensor. A file is read as fast as possible, in batches. Its
     intervals are measured by packet time, and can be longer than requested. Several sources are
     read one after another.
     """
@@ -407,7 +408,7 @@ def stats(
                 )
                 has_findings = True
             try:
-                conclude(device)
+                report_outcome(device)
             except click.exceptions.Exit:  # damage; the remaining sources are still read
                 has_findings = True
     if has_findings:

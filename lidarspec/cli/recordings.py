@@ -145,7 +145,7 @@ def _make_slice_error(source: str, target: str, times: str) -> UsageError:
 
 def _print_recording(task: SourceRecording) -> None:
     with Progress() as progress, contextlib.closing(task.run()) as remarks:
-        progress.show_progress(
+        progress.run_task(
             remarks,
             lambda: _describe_recording(task, task.recorder) if task.recorder is not None else "",
         )
@@ -178,7 +178,8 @@ def _sum_up_recording(
                 CommandError(f"{source} sent nothing"), f"lidarspec doctor {shlex.quote(source)}"
             )
         raise suggest(
-            WireError(f"{source} contains no data from a sensor"), "lidarspec record --help"
+            WireError(f"{source} contains no data from a sensor, so nothing was recorded"),
+            f"lidarspec info {shlex.quote(source)}",
         )
     stats = device.stats if device is not None else None
     summary = f"{recorder.path}: {_describe_recording(task, recorder)}"
@@ -305,7 +306,7 @@ def _run_replay(played: Replay, destination: Outlet | BackgroundWriter, file: st
     """Run a replay, and return whether the user interrupted it."""
     with contextlib.closing(destination), Progress() as progress:
         try:
-            progress.show_progress(played.run(), lambda: _describe_progress(played))
+            progress.run_task(played.run(), lambda: _describe_progress(played))
         except KeyboardInterrupt:
             return True
         except WireError as error:

@@ -63,9 +63,12 @@ GROUPS = {
         "send": ("build", "Send a command to a sensor, and print its reply."),
         "clock": (
             "clock",
-            "Diagnose the clocks of sensors: source of time, lock, offset, drift, jumps.",
+            "Diagnose sensor clocks: time source, synchronization, offset, drift, jumps.",
         ),
-        "stats": ("read", "Print speed, rates, errors, loss, jitter and queue of a sensor."),
+        "stats": (
+            "read",
+            "Print scan rate, packet rate, errors, loss, jitter and queue of a sensor.",
+        ),
     },
     "files": {
         "info": (
@@ -76,10 +79,10 @@ GROUPS = {
             "convert",
             "Write the points of a recording or capture to a file of another format.",
         ),
-        "plot": ("plot", "Draw a scan, or intensities, ranges and rates over time."),
+        "plot": ("plot", "Draw a scan, a histogram of intensities, or ranges or rates over time."),
     },
     "bytes": {
-        "parse": ("frames", "Print the fields of each frame in hexadecimal text or a file."),
+        "parse": ("frames", "Read frames from hexadecimal text or a file, and print their fields."),
         "explain": (
             "frames",
             "Explain every byte of each frame: offset, hex, field, value, unit, meaning.",
@@ -265,13 +268,15 @@ def _format_cost(seconds: float) -> str:
 @click.version_option(__version__, prog_name="lidarspec", message="%(prog)s %(version)s")
 @click.pass_context
 def main(ctx: click.Context) -> None:
-    """Read, record, simulate and explain lidars, each from one description of its wire protocol.
+    """Read, record and simulate lidars, and explain the bytes that they send.
+
+    Each sensor is described once, and all verbs use this description of its wire protocol.
 
     SOURCE is a serial port (/dev/ttyUSB0, COM4), a socket (udp://:2368, tcp://HOST:PORT), a
     simulated sensor (sim:ID), a file (.lsr, .pcap, .pcapng, .bin, .hex) or - for standard input.
 
-    Exit codes: 0 ok, 1 findings, 2 usage, 3 source cannot be opened, 4 no valid data, 5 device
-    refused, 130 interrupted.
+    Exit codes: 0 ok, 1 a fault was found, 2 wrong usage, 3 the source cannot be opened, 4 no valid
+    data, 5 the device refused or sent nothing, 130 interrupted.
     """
     if ctx.invoked_subcommand is None:
         from lidarspec.cli.sensors import guide

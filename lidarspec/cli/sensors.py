@@ -119,7 +119,8 @@ def sensors(as_json: bool, output: str | None) -> None:
     "--plan",
     "as_plan",
     is_flag=True,
-    help="Show how points are computed, and which values need the slow reference evaluator.",
+    help="Show how points are computed, and which values need the reference evaluator, a slow"
+    " general method.",
 )
 @output_options
 def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> None:
@@ -234,7 +235,7 @@ def _list_plan(sensor: Sensor, frame: str) -> list[str]:
     sent = pack_found([Found(frame, 0, data) for data in frames])
     packets = PacketStream(sensor, frame, Counters()).add([sent]).with_points
     if not isinstance(packets.table, CompiledTable) or not packets.table.groups:
-        return ["reference evaluator: the example has no points"]
+        return ["reference evaluator: the example frame has no points, so there is no faster plan"]
     largest = max(packets.table.groups, key=lambda group: group.layout.size)
     plan = plan_for(sensor.points_of(packets.frame), packets.batch(), largest)
     if isinstance(plan, Plan):
@@ -248,8 +249,9 @@ def _list_plan(sensor: Sensor, frame: str) -> list[str]:
 def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
     """List the installed plugins, with the error of each plugin that fails.
 
-    All plugins are loaded in one separate process. If it hangs or exits, each plugin is loaded in a
-    process of its own, to find the plugin at fault. The exit code is 1 if a plugin fails.
+    All plugins are loaded in one separate process. If a plugin makes this process hang or exit,
+    each plugin is loaded in a process of its own, to find the plugin at fault. The exit code is 1
+    if a plugin fails.
     """
     from lidarspec.plugins import try_plugins
 

@@ -119,7 +119,7 @@ PLACES = (
 @click.option(
     "--unplug",
     type=DURATION,
-    help="Disconnect the sensor repeatedly, each time after this time.",
+    help="Disconnect the sensor whenever it has been connected for this time.",
 )
 @click.option(
     "--shake",
@@ -138,8 +138,9 @@ PLACES = (
 @click.option(
     "--clock",
     metavar="FAULT,...",
-    help="Faults of the clock to simulate, separated by commas: utc, tai, gps, drift=50ppm,"
-    " step=0.2s@10s, pps@10s, leap@10s, unlock=5s@10s, restart@10s.",
+    help="Time scale of the clock (utc, tai or gps) and faults to simulate, separated by commas:"
+    " drift=50ppm, step=0.2s@10s, pps@10s, leap@10s, unlock=5s@10s, restart@10s. @10s means 10 s"
+    " after power-on.",
 )
 @click.option("--rotor", type=click.Choice([BLOCKED]), help="Simulate a blocked rotor.")
 @click.option("--force", is_flag=True, help="Overwrite an existing file.")
@@ -232,7 +233,9 @@ def _serve(
     finally:
         opened.close()
         if opened.unsent_bytes:
-            lost = f"; {format_size(opened.unsent_bytes)} of the data were not read by a program"
+            lost = (
+                f"; {format_size(opened.unsent_bytes)} were dropped: no program read them in time"
+            )
         else:
             lost = ""
         note(f"{_format_sent(device)}{lost}")

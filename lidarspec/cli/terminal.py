@@ -70,7 +70,10 @@ def note(text: str) -> None:
 
 @contextlib.contextmanager
 def prepare_streams() -> Iterator[None]:
-    """Prepare standard input, output and error for a verb, and flush them at its end.
+    """Make the standard streams usable, and flush output when the context ends.
+
+    Closed streams are replaced, characters that cannot be encoded are printed as "?", and warnings
+    are printed as remarks.
 
     Raises:
         BrokenPipeError: if the reader has closed the pipe.
@@ -136,7 +139,7 @@ def _discard_stream(stream: Any) -> None:
 
 @contextlib.contextmanager
 def handle_sigterm() -> Iterator[None]:
-    """Handle SIGTERM like Ctrl-C, so that the verb cleans up before it ends."""
+    """Handle SIGTERM like Ctrl-C in this context, so that a verb cleans up."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield

@@ -14,9 +14,9 @@ import click
 
 from lidarspec.cli.inputs import (
     FIRST_FRAME_TIMEOUT_S,
-    conclude,
     no_scan_error,
     refuse_overwriting,
+    report_outcome,
     require_points,
 )
 from lidarspec.cli.options import DURATION, colour_option, selection_options, sensor_option
@@ -106,12 +106,14 @@ def view(
     """Draw a live sensor in the terminal, or with --web in the browser.
 
     The points are drawn from above, and also from the side if they are not in one plane. A file is
-    played at the speed of its times. If standard output is not a terminal, one picture is printed.
+    played in real time, by its recorded times. If standard output is not a terminal, one picture is
+    printed.
 
     Keys: space pauses, r records, c switches colours, + - zoom, arrows move, 0 shows all points, ?
     lists the keys, q quits.
 
-    --rerun requires lidarspec[rerun]. It reads a file as fast as possible, and the viewer plays it.
+    With --rerun, a file is read as fast as possible, and played in Rerun's viewer. This requires
+    lidarspec[rerun].
     """
     if once + web + in_rerun > 1:
         raise UsageError("--once, --web and --rerun cannot be combined")
@@ -134,7 +136,7 @@ def view(
                 _draw_once(device, source, ramp, duration or FIRST_FRAME_TIMEOUT_S, selection),
                 colour=True,
             )
-            conclude(device)
+            report_outcome(device)
         return
     if is_live(source):
         switch = RecordingSwitch(source, Path.cwd())
@@ -157,7 +159,7 @@ def view(
             ),
             stdin_is_data=source == "-",
         )
-        conclude(device)
+        report_outcome(device)
     if switch is not None:
         _report_recordings(switch.written, switch.trouble)
 
@@ -196,7 +198,7 @@ def _serve(
             if opens and not _open_in_browser(server):
                 note("no browser found: open the link in a browser")
             server.run(duration)
-            conclude(server.device)
+            report_outcome(server.device)
     finally:
         _report_recordings(server.recordings, server.trouble)
 
@@ -245,7 +247,7 @@ def _show_in_rerun(
         if feed.scan is None:
             raise no_scan_error(device, source, duration)
         note(f"{target or 'shown'}: {feed.number} scans of {device.sensor.id}")
-        conclude(device)
+        report_outcome(device)
 
 
 def _run_window(device: Device, window: Window, *, stdin_is_data: bool) -> None:
