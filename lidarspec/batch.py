@@ -347,7 +347,7 @@ class Manifest:
             return False
         except RecursionError:
             error = SourceError(
-                f"line {number} of {self.path} is no record: its brackets are nested too deeply"
+                f"{self.path}: line {number} is no record: its brackets are nested too deeply"
             )
             raise suggest(error, "delete the line; the piece is then converted again") from None
         if not _is_record(record):
