@@ -47,7 +47,7 @@ from lidarspec.errors import (
     suggest,
     suggestion,
 )
-from lidarspec.formats import find_existing, format_of, require_feature, write, write_imu
+from lidarspec.formats import find_replaceable_files, format_of, require_feature, write, write_imu
 from lidarspec.formats.common import replace_file
 from lidarspec.formats.frame_tables import holds_several_types, write_frames
 from lidarspec.framing.frame_engine import get_codec
@@ -254,7 +254,7 @@ def convert(
         return
     if frame is None:
         format_of(target)
-    refuse_overwriting(find_existing(target), source, sensor_id, force=force)
+    refuse_overwriting(find_replaceable_files(target), source, sensor_id, force=force)
     if sensor_id is None:
         sensor = _detect_sensor(source, target)
     else:

@@ -14,8 +14,9 @@
 * `messages`: ROS messages of scans, packets and IMU samples.
 * `bags`: .mcap, .bag, .rosbag2 and .db3, one message per scan.
 * `foxglove`: .foxglove.mcap, with Foxglove messages.
-* `frame_tables`: .csv, .parquet, .arrow, .feather and .mcap, one row per frame of any type.
 * `rerun`: .rrd, for the Rerun viewer.
+* `frame_tables`: has a `write_frames` of its own, which writes frames of any type instead of scans,
+  one row per frame, to .csv, .parquet, .arrow, .feather and .mcap.
 """
 
 from __future__ import annotations
@@ -134,10 +135,11 @@ def write_imu(path: str | Path, samples: ImuSamples) -> None:
             np.savez(part, **samples.columns)  # type: ignore[arg-type]  # no column is called allow_pickle
 
 
-def find_existing(path: str | Path) -> list[str]:
-    """Return the files that `write` may replace.
+def find_replaceable_files(path: str | Path) -> list[str]:
+    """Return the paths of the files that `write(path)` may replace.
 
-    A path without placeholders is returned even if the file does not exist.
+    If the path has placeholders, these are the existing files with such names. Otherwise, it is the
+    path itself, even if there is no such file.
     """
     path = Path(path)
     if not PLACEHOLDER.search(str(path)):
@@ -168,7 +170,7 @@ def write(
         scans: the scans.
         every_point: whether to write points without a valid return as well.
         organized: whether to write every point of a scan in rows and columns, with nan for missing
-            points.
+            points; implies `every_point`.
         packets: raw packets to write to a ROS log in addition to the points.
 
     Raises:

@@ -49,10 +49,10 @@ def write_array(
 
 
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False) -> None:
-    """Write an .npz file with an array for each column, and arrays about the scans.
+    """Write an .npz file with an array for each column of the points.
 
     A column is written if all scans have it. With `organized`, arrays have the shape (rows,
-    columns).
+    columns). The arrays stamp_ns, rate_hz and complete have one element for each scan.
     """
     height: int | None = None
     with contextlib.ExitStack() as files:
@@ -127,7 +127,10 @@ def _make_npy_header(rows: PointRows) -> bytes:
 
 
 class _ZarrColumn:
-    """A Zarr array that grows by whole chunks."""
+    """A Zarr array that grows by whole chunks.
+
+    Added values wait in memory until they fill a chunk.
+    """
 
     def __init__(
         self, group: Any, name: str, dtype: DTypeLike, *, unit: str = "", along: str = "points"
@@ -155,7 +158,7 @@ class _ZarrColumn:
             self.write(self._length - self._length % self._chunk)
 
     def write(self, count: int) -> None:
-        """Write the first `count` waiting values."""
+        """Write the first `count` of the values that wait in memory."""
         waiting = np.concatenate([np.empty(0, self._array.dtype), *self._waiting])
         self._array.append(waiting[:count])
         self._waiting = [waiting[count:].copy()]
@@ -167,10 +170,10 @@ class _ZarrColumn:
 
 
 def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write a Zarr folder with the columns of the points, and arrays about the scans.
+    """Write a Zarr folder with an array for each column of the points.
 
     The columns are those of the first scan. If a later scan lacks a column, its values are nan, or
-    0 for integers.
+    0 for integers. The arrays in `SCAN_COLUMNS` have one element for each scan.
     """
     group = import_library("zarr", "zarr").open_group(str(path), mode="w")
     scan_columns = {

@@ -47,7 +47,7 @@ def iter_tables(
 
     Args:
         path: the path of the file. If a folder of the path has a name such as scan=7, the column
-            `scan` is left out, as in Hive.
+            `scan` is left out, because readers take it from the name (Hive partitioning).
         every_point: whether to include points without a valid return.
     """
     arrow = import_library("pyarrow", "arrow")

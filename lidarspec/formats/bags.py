@@ -27,8 +27,8 @@ TOPICS = {CLOUD: "/points", SCAN: "/scan", RAW: "/packets"}
 CHUNK_BYTES = 1 << 20
 
 
-class BagWriter:
-    """Makes the messages of one log.
+class LogMessages:
+    """The messages of one log, which are made from scans and raw packets.
 
     Args:
         release: the ROS release of the message definitions, e.g. "ROS1_NOETIC".
@@ -46,7 +46,9 @@ class BagWriter:
     def iter_messages(
         self, scans: Iterable[Scan], packets: Iterable[Chunk], *, every_point: bool
     ) -> Iterator[RosMessage]:
-        """Yield the messages of scans and packets, merged by time if both are in order.
+        """Yield the messages of scans and packets in the order of time.
+
+        If the scans or the packets are not in this order, neither are the messages.
 
         Raises:
             UsageError: for a stamp that no message can contain.
@@ -74,20 +76,20 @@ def write_mcap(
 ) -> None:
     """Write an MCAP file with ROS 2 messages."""
     mcap = import_library("mcap.writer", "ros")
-    bag_writer = BagWriter("ROS2_HUMBLE")
+    log_messages = LogMessages("ROS2_HUMBLE")
     channels = dict[str, int]()
     with path.open("wb") as file:
         log = mcap.Writer(file, chunk_size=CHUNK_BYTES, compression=mcap.CompressionType.NONE)
         log.start(profile="ros2", library="lidarspec")
-        for kind, at, data in bag_writer.iter_messages(scans, packets, every_point=every_point):
+        for kind, at, data in log_messages.iter_messages(scans, packets, every_point=every_point):
             if kind not in channels:
-                text, _ = bag_writer.types.generate_msgdef(kind, ros_version=2)
+                text, _ = log_messages.types.generate_msgdef(kind, ros_version=2)
                 channels[kind] = log.register_channel(
                     TOPICS[kind], "cdr", log.register_schema(kind, "ros2msg", text.encode())
                 )
             log.add_message(channels[kind], log_time=at, publish_time=at, data=data)
-        if bag_writer.units:
-            log.add_metadata("units", bag_writer.units)
+        if log_messages.units:
+            log.add_metadata("units", log_messages.units)
         log.finish()
 
 
@@ -95,11 +97,11 @@ def write_ros1(
     path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, every_point: bool
 ) -> None:
     """Write a ROS 1 bag, as `rosbag record` does."""
-    bag_writer = BagWriter("ROS1_NOETIC")
+    log_messages = LogMessages("ROS1_NOETIC")
     _record(
         import_library("rosbags.rosbag1", "ros").Writer(path),
-        bag_writer,
-        bag_writer.iter_messages(scans, packets, every_point=every_point),
+        log_messages,
+        log_messages.iter_messages(scans, packets, every_point=every_point),
     )
 
 
@@ -125,26 +127,32 @@ def write_ros2(
         bag = Path(folder) / "scans"
         log = rosbag2.Writer(bag, version=8, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
         try:
-            bag_writer = BagWriter("ROS2_HUMBLE")
+            log_messages = LogMessages("ROS2_HUMBLE")
             _record(
-                log, bag_writer, bag_writer.iter_messages(scans, packets, every_point=every_point)
+                log,
+                log_messages,
+                log_messages.iter_messages(scans, packets, every_point=every_point),
             )
         except sqlite3.Error as error:
             raise OSError(str(error)) from None
         (bag if storage == "mcap" else bag / "scans.db3").rename(path)
 
 
-def _record(log: Any, bag_writer: BagWriter, messages: Iterable[RosMessage]) -> None:
-    """Write messages with a writer of rosbags."""
+def _record(log: Any, log_messages: LogMessages, messages: Iterable[RosMessage]) -> None:
+    """Write messages to a log.
+
+    Args:
+        log: a log writer of the library rosbags.
+    """
     connections = dict[str, Any]()
     with log:
         for kind, at, data in messages:
             if kind not in connections:
                 connections[kind] = log.add_connection(
-                    TOPICS[kind], kind, typestore=bag_writer.types
+                    TOPICS[kind], kind, typestore=log_messages.types
                 )
             log.write(connections[kind], at, data)
-        for name, unit in bag_writer.units.items() if hasattr(log, "set_custom_data") else ():
+        for name, unit in log_messages.units.items() if hasattr(log, "set_custom_data") else ():
             log.set_custom_data(f"unit of {name}", unit)
 
 

@@ -45,7 +45,7 @@ def replace_file(path: Path) -> Iterator[Path]:
 
     Raises:
         SourceError: if the file cannot be written.
-        UsageError: if the path is a folder with files that are not from an export.
+        UsageError: if the path is a folder with files that do not belong to its format.
     """
     refuse_foreign_files(path)
     remove_abandoned(path)
@@ -66,7 +66,7 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 
 def refuse_foreign_files(folder: Path) -> None:
-    """Raise UsageError if a folder contains files that are not from an export."""
+    """Raise UsageError if a folder contains files that do not belong to its format."""
     if not folder.is_dir():
         return
     pattern = FOLDER_FILES.get(folder.suffix.lower())
@@ -83,8 +83,8 @@ def refuse_foreign_files(folder: Path) -> None:
 def write_in_thread(write: Callable[[_Piece], object]) -> Iterator[Callable[[_Piece], None]]:
     """Yield a function that writes a piece in a thread.
 
-    All pieces are written when the block ends. An error in the thread is raised by the next call,
-    or at the end of the block.
+    When the block ends, all pieces have been written. An error in the thread is raised by the next
+    call, or at the end of the block.
     """
     with ThreadPoolExecutor(1) as thread:
         last: Future[object] = thread.submit(lambda: None)

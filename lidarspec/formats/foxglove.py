@@ -39,8 +39,8 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
         for scan in scans:
             if scan.stamp_ns < 0:
                 raise UsageError(
-                    f"the stamp of a scan is {scan.stamp_ns} ns, but MCAP files have no time"
-                    " before 1970"
+                    f"the stamp of a scan is {scan.stamp_ns} ns, which is before 1970: an MCAP file"
+                    " cannot store it"
                 )
             units |= {name: unit for name, unit in scan.points.units.items() if unit}
             messages = {TOPICS[CLOUD]: _make_cloud(scan.points, every_point=every_point)}

@@ -1,7 +1,8 @@
-"""Write frames of any type, one row per frame, with their fields in units.
+"""Write frames of any type, one row per frame, with physical values of the fields.
 
 A row has the time of the frame, `time_ns`, and each field that is not constant. Each element of an
-array of numbers is a column, for example `gains[2]`. Parts of a frame have rows of their own.
+array of numbers is a column, for example `gains[2]`. A part of a frame (a frame within the frame)
+counts as a frame of another type, and has a row of its own.
 
 A table contains one frame type. An MCAP file has a topic for each type, with JSON messages.
 """
@@ -82,7 +83,7 @@ def _format_bytes(values: NDArray[Any], *, is_text: bool) -> list[str]:
 
 
 def _format_objects(path: str, values: NDArray[Any]) -> Columns:
-    """Return a column of texts for each element of a field with texts or objects."""
+    """Return a column of texts for each element of a field whose values are objects."""
     return {
         name: ["" if value is None else str(value) for value in column.tolist()]
         for name, column in _split_elements(path, values).items()

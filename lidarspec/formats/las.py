@@ -89,7 +89,7 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compresse
 def _fill_header(
     laspy: Any, header: Any, own: Mapping[str, NDArray[Any]], scan: Scan
 ) -> dict[str, str]:
-    """Add extra dimensions, and the facts of the first scan, to a header.
+    """Set the extra dimensions, scales, offsets and sensor of a header, from a scan.
 
     Returns:
         The name of the extra dimension of each column.
@@ -147,6 +147,8 @@ def _fill_records(
     """Fill LAS records with points.
 
     Args:
+        rows: the records to fill.
+        part: the columns of the points.
         extra_names: the name of the extra dimension of each column.
         offsets: the offsets of x, y and z, in metres.
     """

@@ -60,10 +60,10 @@ class RosMessages:
         self._has_sequence = release.startswith("ROS1")
 
     def raw(self, packet: Chunk, *, datagram: bool = True) -> RosMessage:
-        """Return a raw packet as a message that `transports.robotics_logs` can read.
+        """Return a message with a raw packet, which `transports.robotics_logs` can read.
 
         Args:
-            datagram: whether the packet is a datagram, not a piece of a stream.
+            datagram: True if the packet is a datagram, False if it is a piece of a stream.
         """
         at = packet.at or 0
         size = len(packet.data)

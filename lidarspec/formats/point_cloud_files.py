@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, suggest
 from lidarspec.formats.common import ColumnSpool
-from lidarspec.formats.point_rows import PointRows, pad_header, write_rows
+from lidarspec.formats.point_rows import PointRows, make_padding, write_rows
 from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
@@ -105,7 +105,7 @@ def _make_pcd_header(rows: PointRows, data: str = "binary") -> bytes:
     width, height = rows.shape or (rows.length, 1)
     types = [rows.dtype[name] for name in rows.dtype.names or ()]
     lines = [
-        "# .PCD v0.7 - Point Cloud Data file format" + pad_header(width, rows.length),
+        "# .PCD v0.7 - Point Cloud Data file format" + make_padding(width, rows.length),
         *(f"# {fact}" for fact in rows.facts),
         "VERSION 0.7",
         f"FIELDS {' '.join(rows.dtype.names or ())}",
@@ -139,7 +139,7 @@ def _make_ply_header(rows: PointRows) -> bytes:
         "format binary_little_endian 1.0",
         *(
             f"comment {fact}"
-            for fact in ["made by lidarspec" + pad_header(rows.length), *rows.facts]
+            for fact in ["made by lidarspec" + make_padding(rows.length), *rows.facts]
         ),
         f"element vertex {rows.length}",
         *(

@@ -106,8 +106,8 @@ def write_rows(path: Path, rows: PointRows, header: Callable[[PointRows], bytes]
     """Write a header and rows.
 
     Args:
-        header: a function that returns the header. It is called twice, and the length of the header
-            must not depend on the number of rows.
+        header: a function that returns the header. It is called before and after the rows are
+            written. The second header overwrites the first, so both must have the same length.
     """
     with path.open("wb") as file:
         file.write(header(rows))
@@ -124,6 +124,10 @@ def write_rows(path: Path, rows: PointRows, header: Callable[[PointRows], bytes]
         file.write(header(rows))
 
 
-def pad_header(*numbers: int) -> str:
-    """Return spaces that make the length of a header independent of `numbers`."""
+def make_padding(*numbers: int) -> str:
+    """Return the spaces that a header needs so that its length is always the same.
+
+    Args:
+        numbers: the numbers in the header whose digits vary.
+    """
     return " " * sum(RESERVED_DIGITS - len(str(number)) for number in numbers)

@@ -47,7 +47,8 @@ class RerunRecording:
     data to a viewer.
 
     Args:
-        ramp: the column that the colours show: "range", "intensity" or an additional column.
+        ramp: the column whose values the colours show: "range", "intensity" or an additional
+            column.
 
     Raises:
         UsageError: if the Rerun SDK is not installed.
@@ -256,7 +257,7 @@ def _translate_errors() -> Iterator[None]:
 
 
 class _Colours:
-    """Returns the colours of points, on the scale of the first cloud."""
+    """The colours of points; the first cloud with points sets the scale for all."""
 
     def __init__(self) -> None:
         self._look: CloudAppearance | None = None

@@ -15,7 +15,7 @@ import pytest
 
 from lidarspec import simulate
 from lidarspec.errors import UsageError
-from lidarspec.formats import arrow_tables as tables, find_existing, write
+from lidarspec.formats import arrow_tables as tables, find_replaceable_files, write
 from tests.formats.test_formats import COLUMNS, scan
 from tests.libraries import Library, needs
 from tests.shapes import SHAPES
@@ -193,7 +193,7 @@ def test_times_in_the_name_share_scans_out(tmp_path: Path) -> None:
         set(parquet.ParquetFile(tmp_path / file).read()["scan"].to_pylist()) for file in files
     ]
     assert numbers == [{0, 1}, {2}, {3}, {4}]  # they count on
-    assert find_existing(name) == [str(tmp_path / file) for file in files]
+    assert find_replaceable_files(name) == [str(tmp_path / file) for file in files]
     with pytest.raises(UsageError, match=r"00\.parquet would be written twice"):
         write(tmp_path / "%H.parquet", [at(0, 0), at(1, 3600), at(2, 86_400)])
 
