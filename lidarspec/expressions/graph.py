@@ -1,11 +1,12 @@
 """Trace a function of fields: record its steps as a graph by calling it once.
 
-`trace` calls a `points`, `plausible` or clock function, and returns its result and the `Trace` of
-its steps. A step is a `Node`: a field, a state column, an elementwise call, or a step that depends
-on the order of packets. A step that cannot be recorded, such as a branch that depends on data,
-raises `UntraceableError`.
+A sensor declares functions of the fields of a frame, such as the function that computes the points.
+`trace` calls such a function, and returns its result and the `Trace` of its steps. A step is a
+`Node`: a field, a state column, an elementwise call, or a step that depends on the order of
+packets. A step that cannot be recorded, such as a branch that depends on data, raises
+`UntraceableError`.
 
-`traverse` iterates over the nodes of a graph, and `compute` evaluates it for given values of the
+`traverse` iterates over the nodes of a graph. `compute` evaluates one node for given values of the
 fields.
 """
 
@@ -29,7 +30,10 @@ from lidarspec.spec.vocabulary import ELEMENTWISE, AlongAxis
 
 
 class UntraceableError(Exception):
-    """An operation that only the reference evaluator can execute; the message is the reason."""
+    """The error for a function that cannot be evaluated with a graph.
+
+    The message is the reason. The function is then called for each batch instead.
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,15 +41,17 @@ class Node:
     """One step of a traced function.
 
     Attributes:
-        kind: "field", "state", "shift", "latest", "on", "running", "rows" (rows of a table,
-            selected by indices) or "call".
+        kind: "field" (of the frame), "state" (a field of other frames), "call" (of an elementwise
+            function), "rows" (rows of a table, from `Column.gather`), or the name of another method
+            of `Column`: "shift", "latest", "on" or "running".
         function: for "call", a function of arrays that broadcast; for "field" and "state", a
             function of `Fields` that returns the column; otherwise a function of columns that
             returns a column.
         args: the arguments: nodes, numbers and arrays.
         sample: the result for the sample packets.
         number: the position of the node in the order of evaluation.
-        path: the path of a field or state column, as it is written after ``f.``.
+        path: for "field" and "state", the path in the traced function: "header.time" for
+            ``f.header.time``, if the function has the parameter f.
     """
 
     kind: str
@@ -62,7 +68,7 @@ class Node:
 
     @cached_property
     def width(self) -> int:
-        """The number of values of each packet; 0 if all packets share the values."""
+        """The number of values of the node for each packet; 0 if all packets share them."""
         size = int(np.prod(self.shape, dtype=np.intp))
         if self.sample.shape[0] > 1:
             return size
@@ -99,7 +105,10 @@ class Node:
 
     @cached_property
     def _operands(self) -> list[tuple[bool, Any]]:
-        """For each argument, whether it is a node, and its missing axes or the constant."""
+        """A pair for each argument.
+
+        (True, the axes of length 1 to append) for a node, (False, the array) for a constant.
+        """
         depth = max(len(arg.sample.axes) for arg in self.args if isinstance(arg, Node))
         return [
             (
@@ -126,12 +135,12 @@ class Node:
 
 @dataclass
 class Trace:
-    """The steps of a traced function, and the assumptions of the trace.
+    """The nodes of a traced function, and the conditions for using them.
 
     Attributes:
         nodes: the nodes in the order in which they were made.
-        steps: for each call of `Column.steps`, the node and the length of the result. The trace is
-            valid only for packets with these lengths.
+        steps: for each call of `Column.steps`, the node of the column and the length of the result.
+            The trace is valid only for packets with these lengths.
     """
 
     nodes: list[Node] = field(default_factory=list)
@@ -215,17 +224,19 @@ class TracedColumn(NDArrayOperatorsMixin):
 
     @property
     def index(self) -> AlongAxis:
-        """0, 1, 2 ... along the innermost array of the column."""
+        """The numbers 0, 1, 2 ... of the elements of the column's innermost array."""
         return self.node.sample.index
 
     def on(self, *axes: str) -> Any:
-        """Record `Column.on`."""
+        """Record a call of `Column.on`."""
         sample = self.node.sample.on(*axes)
         if sample.array.size > self.node.sample.array.size:
             # The sample packets have no elements of the column's array.
             if not self.node.sample.array.size:
                 return np.nan
-            raise UntraceableError(".on() cannot move values to a longer array")
+            raise UntraceableError(
+                f".on({', '.join(map(repr, axes))}) moves a column to a longer array"
+            )
         if (
             sample.axes == self.node.sample.axes
             and sample.array.shape == self.node.sample.array.shape
@@ -234,7 +245,7 @@ class TracedColumn(NDArrayOperatorsMixin):
         return self._tape.add("on", lambda column: column.on(*axes), (self,), sample)
 
     def gather(self, table: NDArray[np.float64]) -> TracedColumn:
-        """Record `Column.gather`."""
+        """Record a call of `Column.gather`."""
         return self._tape.add(
             "rows",
             lambda column, rows: column.gather(rows),
@@ -243,7 +254,7 @@ class TracedColumn(NDArrayOperatorsMixin):
         )
 
     def running(self) -> TracedColumn:
-        """Record `Column.running`."""
+        """Record a call of `Column.running`."""
         return self._tape.add(
             "running", lambda column: column.running(), (self,), self.node.sample.running()
         )
@@ -255,13 +266,13 @@ class TracedColumn(NDArrayOperatorsMixin):
         return indices
 
     def shift(self, step: int) -> TracedColumn:
-        """Record `Column.shift`."""
+        """Record a call of `Column.shift`."""
         return self._tape.add(
             "shift", lambda column: column.shift(step), (self,), self.node.sample.shift(step)
         )
 
     def latest(self, where: Any = None) -> TracedColumn:
-        """Record `Column.latest`."""
+        """Record a call of `Column.latest`."""
         if isinstance(where, TracedColumn):
             condition = where.node.sample
         else:
@@ -353,10 +364,14 @@ def _check_raw(schema: Schema, path: str) -> None:
 def _fold_table_rows(
     function: Callable[..., Any], values: Sequence[Any], arrays: Sequence[Any]
 ) -> tuple[Node, NDArray[np.float64]] | None:
-    """Apply a function to whole tables, before their rows are looked up.
+    """Replace ``function(table[indices])`` by ``function(table)[indices]``.
+
+    The function is then computed once for the table, not for the rows of each packet.
 
     Returns:
-        The node of the indices, and the new table. None if this is not possible.
+        The node of the indices, and the table of the results. None if the arguments are not table
+        rows with the same indices and constants, or if the results have another shape or dtype than
+        the table.
     """
     nodes = [value.node for value in values if isinstance(value, TracedColumn)]
     if any(node.kind != "rows" or node.args[0] is not nodes[0].args[0] for node in nodes):
@@ -401,18 +416,19 @@ def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Trace]:
 
 
 def make_sample(batch: Batch, group: LayoutRows) -> Batch:
-    """Return a batch for tracing, which has the first frame of a group twice."""
+    """Return a batch for tracing: two copies of the first frame of a group."""
+    # With two packets, values that all packets share can be recognized: they are there once.
     return batch.of(
         LayoutRows(group.layout, group.where[[0, 0]], np.ascontiguousarray(group.rows[[0, 0]]))
     )
 
 
 def traverse(*values: Any, into: Callable[[Node], bool] = lambda node: True) -> Iterator[Node]:
-    """Yield each node in the expressions `values` once.
+    """Yield each node that the given values depend on, once.
 
     Args:
         values: nodes, traced columns, or constants, which have no nodes.
-        into: a function that returns whether to visit the arguments of a node.
+        into: a function that returns whether the arguments of a node are visited too.
     """
     seen = set[Node]()
     waiting = [get_node(value) for value in values]
@@ -431,7 +447,8 @@ def compute(
 
     Args:
         results: the known values of nodes, to which new values are added.
-        source: a function that returns the value of a node, such as a field, or None to compute it.
+        source: a function that returns the value of a node if it is known, for example for a field.
+            If the function returns None, the node is computed.
 
     Returns:
         A column if the values of the fields are columns, otherwise an array.
@@ -525,13 +542,14 @@ class HeaderFunction:
 
     Args:
         function: a function of `Fields` that returns a column, or several columns (the terms).
-        to_integers: a function that converts the values of a term to integers.
+        to_integers: a function that converts the values of a term to integers, for example seconds
+            to nanoseconds. The sum of the terms is then exact.
     """
 
     def __init__(self, function: Callable[[Any], Any], to_integers: IntegerConverter) -> None:
         self._function = function
         self._to_integers = to_integers
-        self._terms: list[_ResultPart] | None = None
+        self._terms: list[_TermEvaluator] | None = None
         self._is_tried = False
 
     def __call__(self, batch: Batch) -> list[NDArray[np.int64]]:
@@ -546,11 +564,11 @@ class HeaderFunction:
             ]
         return [term(table) for term in self._terms]
 
-    def _split_terms(self, batch: Batch, table: CompiledTable) -> list[_ResultPart] | None:
+    def _split_terms(self, batch: Batch, table: CompiledTable) -> list[_TermEvaluator] | None:
         try:
             traced, _ = trace(self._function, make_sample(batch, table.groups[0]))
             return [
-                _ResultPart(Expression.of(term.node, table.schema), self._to_integers)
+                _TermEvaluator(Expression.of(term.node, table.schema), self._to_integers)
                 for term in _to_terms(traced)
             ]
         except Exception:  # calling the function itself reports the error
@@ -563,7 +581,7 @@ def _to_terms(terms: Any) -> Sequence[Any]:
     return (terms,)
 
 
-class _ResultPart:
+class _TermEvaluator:
     """Evaluates one term of a `HeaderFunction`, and caches its values.
 
     Raises:
@@ -644,12 +662,12 @@ FACTORS |= {np.rad2deg: 180 / np.pi, np.degrees: 180 / np.pi}
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A term of a sum, which is the product of a factor and a node.
+    """A term of a sum: a factor, multiplied by a node if there is one.
 
     Attributes:
-        row: the factor, a number or a row of numbers that all packets share.
-        low: the node, if it has one value for each packet or block.
-        full: the node, if each point has its own value.
+        row: the factor: a number, or a row of numbers that all packets share.
+        low: the node, if it has one value for each packet or for each block of points; else None.
+        full: the node, if it has one value for each point; else None.
     """
 
     row: NDArray[np.float64]
@@ -661,8 +679,8 @@ class Term:
         return Term(self.row * factor, self.low, self.full)
 
 
-def is_full(value: Any, width: int) -> bool:
-    """Return whether each of the `width` points of a packet has its own value."""
+def has_value_per_point(value: Any, width: int) -> bool:
+    """Return whether a value is a node with a value for each of `width` points."""
     return isinstance(value, Node) and value.width == width
 
 
@@ -676,12 +694,12 @@ def find_choice(node: Node, width: int) -> tuple[Node, Any, Any] | None:
         return None
     condition, *options = node.args
     fits = [
-        get_only_field(o) is not None and is_full(o, width)
+        get_only_field(o) is not None and has_value_per_point(o, width)
         if isinstance(o, Node)
         else np.size(o) == 1
         for o in options
     ]
-    if not isinstance(condition, Node) or is_full(condition, width) or not all(fits):
+    if not isinstance(condition, Node) or has_value_per_point(condition, width) or not all(fits):
         return None
     return condition, *(
         o if isinstance(o, Node) else float(np.asarray(o).reshape(())) for o in options
@@ -714,7 +732,7 @@ def split_sum(value: Any, width: int) -> list[Term]:
     """Return the terms of a sum; an expression that is not a sum is the only term."""
     if not isinstance(value, Node):
         return [Term(np.asarray(value, np.float64))]
-    if not is_full(value, width) and value.width:
+    if not has_value_per_point(value, width) and value.width:
         return [Term(np.ones(()), low=value)]
     function = value.function
     args = value.args
@@ -741,7 +759,8 @@ def _scale_terms(value: Node, parts: list[Term], factor: Any) -> list[Term]:
     """Return the terms of the product of a sum and a factor.
 
     Args:
-        value: the product.
+        value: the node of the product. It is the only term of the result if a factor that is a row
+            meets a term with a value for each point.
         parts: the terms of the sum.
         factor: a number, or a row of numbers that all packets share.
     """

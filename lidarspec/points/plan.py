@@ -27,7 +27,7 @@ from lidarspec.expressions.graph import (
     TracedColumn,
     UntraceableError,
     get_only_field,
-    is_full,
+    has_value_per_point,
 )
 from lidarspec.frames.frame_table import LayoutRows
 from lidarspec.frames.layout import Bytes2D, Layout, Leaf
@@ -124,7 +124,8 @@ class Plan:
             raise UntraceableError("the packets have no points")
         self.exact = isinstance(result, Cartesian)
         if not any(
-            is_full(self.parts[name], self.width) for name in ("xyz" if self.exact else ["range"])
+            has_value_per_point(self.parts[name], self.width)
+            for name in ("xyz" if self.exact else ["range"])
         ):
             raise UntraceableError(
                 f"`points` does not return {'coordinates' if self.exact else 'a range'} for each"
@@ -192,7 +193,7 @@ class Plan:
             leaf = None
         if (
             leaf is None
-            or not is_full(part, self.width)
+            or not has_value_per_point(part, self.width)
             or leaf.info.scaled
             or leaf.info.kind != "int"
         ):
@@ -260,10 +261,10 @@ class Plan:
         if get_only_field(node) is None and node.kind == "call" and node.function is np.multiply:
             for full, low in (node.args, node.args[::-1]):
                 if (
-                    is_full(full, self.width)
+                    has_value_per_point(full, self.width)
                     and get_only_field(full) is not None
                     and isinstance(low, Node)
-                    and not is_full(low, self.width)
+                    and not has_value_per_point(low, self.width)
                 ):
                     self.positive.append(low)
                     return returned_range(TracedColumn(full, self.tape)) * TracedColumn(

@@ -22,7 +22,7 @@ from lidarspec.expressions.graph import (
     Node,
     count_used_axes,
     get_only_field,
-    is_full,
+    has_value_per_point,
     is_nan_where,
     traverse,
 )
@@ -136,7 +136,11 @@ class Expressions(KernelWriter):
             return self._write_physical(node)
         if node.kind == "call" and not self.uses_only_other_frames(node):
             source = get_only_field(node)
-            if source is not None and is_full(source, self.width) and not is_cheap(node):
+            if (
+                source is not None
+                and has_value_per_point(source, self.width)
+                and not is_cheap(node)
+            ):
                 text = self.look_up(node, source, np.float64, 1.0)
                 if text is not None:
                     if node.sample.array.dtype.kind == "b":
@@ -286,7 +290,7 @@ class Expressions(KernelWriter):
         value = None if exact else self._write_distance(node)
         if value is not None:
             return value
-        if is_full(node, self.width) and node.kind == "call" and not exact:
+        if has_value_per_point(node, self.width) and node.kind == "call" and not exact:
             beam = find_beam(node, self.layout.leaves) if is_column else None
             along = self._write_along_beam(beam) if beam is not None else None
             if along is not None:
@@ -296,7 +300,7 @@ class Expressions(KernelWriter):
             ):
                 sign = {np.multiply: "*", np.add: "+", np.subtract: "-"}[node.function]
                 return self.combine(sign, *(self.write_single(arg) for arg in node.args))
-            if node.function in (np.cos, np.sin) and is_full(node.args[0], self.width):
+            if node.function in (np.cos, np.sin) and has_value_per_point(node.args[0], self.width):
                 return Trig(node.function.__name__, self.add_angle(node.args[0]))
         if node.kind == "rows" and not self.uses_only_other_frames(node.args[0]) and not exact:
             return self._look_up_row(node, "float32")
@@ -332,7 +336,7 @@ class Expressions(KernelWriter):
         Args:
             raw: True for the raw value, False for metres.
         """
-        if not is_full(node, self.width):
+        if not has_value_per_point(node, self.width):
             return None
         if node.kind == "field":
             leaf = self.layout.leaves.get(node.path)
@@ -378,7 +382,7 @@ class Expressions(KernelWriter):
     def _write_field(self, node: Node, *, exact: bool) -> KernelValue | None:
         """Return the code of an expression of one field, a linear function or a lookup."""
         source = get_only_field(node)
-        if source is not None and is_full(source, self.width):
+        if source is not None and has_value_per_point(source, self.width):
             leaf = self.layout.leaves.get(source.path)
         else:
             leaf = None
@@ -412,7 +416,7 @@ class Expressions(KernelWriter):
         if not isinstance(value, Node):
             return self.write_constant(np.asarray(value) * factor, depth)
         if (
-            not is_full(value, self.width)
+            not has_value_per_point(value, self.width)
             or value.kind != "call"
             or self.uses_only_other_frames(value)
         ):

@@ -20,7 +20,7 @@ from lidarspec.expressions.graph import (
     Term,
     count_used_axes,
     get_only_field,
-    is_full,
+    has_value_per_point,
     make_key,
     split_sum,
 )
@@ -84,7 +84,7 @@ class Compiler:
     def _compile_single(self, value: Any) -> int:
         """Compile an expression to float32."""
         # Only products and tables are computed in float32; other results are converted.
-        if not is_full(value, self._width):
+        if not has_value_per_point(value, self._width):
             return self._broadcast(value, "single")
         return self._make_once(
             ("single", self._is_exact, value), lambda: self._compile_full_single(value)
@@ -121,7 +121,7 @@ class Compiler:
         """Compile a factor of a float32 product; return a function that reads it."""
         if not isinstance(value, Node) and np.size(value) == 1:
             return _make_constant(np.float32(np.asarray(value).reshape(())))
-        if is_full(value, self._width):
+        if has_value_per_point(value, self._width):
             return RegisterRead(self._compile_single(value))
         return RegisterRead(
             self._make_once(("factor", id(value)), lambda: self._broadcast(value, "single"))
@@ -179,7 +179,7 @@ class Compiler:
 
     def _compile_double(self, value: Any) -> int:
         """Compile an expression to float64, or a condition to flags."""
-        if not is_full(value, self._width):
+        if not has_value_per_point(value, self._width):
             return self._broadcast(value, "double")
         return self._make_once(
             ("double", self._is_exact, value), lambda: self._compile_full_double(value)
@@ -208,7 +208,7 @@ class Compiler:
     def _compile_field(self, node: Node, kind: str) -> int | None:
         """Load a field or look it up in a table; return None if neither is possible."""
         source = get_only_field(node)
-        if source is None or not is_full(source, self._width):
+        if source is None or not has_value_per_point(source, self._width):
             return None
         leaf = self._layout.leaves.get(source.path)
         if leaf is None:
@@ -301,7 +301,7 @@ class Compiler:
         index, table = node.args
         inner = table.shape[1]
         inner_shape = self._shape[count_used_axes(index.shape) :]
-        if is_full(index, self._width) or inner != int(np.prod(inner_shape)):
+        if has_value_per_point(index, self._width) or inner != int(np.prod(inner_shape)):
             return None
         self.low.append(index)
         rows = table.astype(TYPES[kind])
@@ -366,7 +366,7 @@ class Compiler:
         used = [
             RegisterRead(self._compile_double(arg))
             for arg in node.args
-            if is_full(arg, self._width)
+            if has_value_per_point(arg, self._width)
         ]
         function = node.function
         is_direct = isinstance(function, np.ufunc)
@@ -384,7 +384,7 @@ class Compiler:
     def _make_argument(self, value: Any, depth: int) -> Callable[[ProgramRun], Any]:
         if not isinstance(value, Node):
             return _make_constant(value)
-        if is_full(value, self._width):
+        if has_value_per_point(value, self._width):
             read = RegisterRead(self._compile_double(value))
             shape = (*value.shape, *(1,) * (depth - len(value.shape)))
             return lambda run: read(run).reshape(-1, *shape)
