@@ -24,7 +24,7 @@ from lidarspec.exports import (
     find_required_formulas,
     list_frames,
 )
-from lidarspec.frames.layout_tree import find_prefix
+from lidarspec.frames.layout_tree import find_fixed_constants
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.spec import (
     Checksum,
@@ -356,7 +356,7 @@ class _TableWriter:
             magic = [
                 [offset, mask, value]
                 for offset, (mask, value) in sorted(
-                    find_prefix(kind.root, self.message.frame.max_length).items()
+                    find_fixed_constants(kind.root, self.message.frame.max_length).items()
                 )
             ]
             after = node.following(kind)

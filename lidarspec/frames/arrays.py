@@ -18,7 +18,7 @@ LARGE_BLOCK_BYTES = 1 << 24
 
 
 def repeat(value: int, *shape: int) -> NDArray[np.int64]:
-    """Return a read-only array of this shape with one value everywhere."""
+    """Return a read-only array of the shape `shape` with one value everywhere."""
     memory = value.to_bytes(8, sys.byteorder, signed=True)
     return np.ndarray(shape, np.int64, memory, 0, (0,) * len(shape))
 
@@ -41,7 +41,7 @@ def count_up(count: int) -> NDArray[np.int64]:
 
 
 def is_count_up(numbers: NDArray[np.int64]) -> bool:
-    """Return whether an array is from `count_up`, so that its values ascend."""
+    """Return whether an array is a result of `count_up`, whose values ascend."""
     return numbers.base is _shared_numbers() and numbers.strides[0] > 0
 
 
@@ -78,9 +78,12 @@ def group_by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np
 
 
 def mark_changes(*columns: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return a mask of the rows that differ from the row before, (n,).
+    """Return a mask of the rows in which a column differs from the row before, (n,).
 
     The first row counts as different.
+
+    Args:
+        columns: arrays of the same length, (n,).
     """
     is_changed = np.zeros(len(columns[0]), np.bool_)
     is_changed[:1] = True
@@ -90,7 +93,11 @@ def mark_changes(*columns: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def split_runs(*columns: NDArray[Any]) -> list[slice]:
-    """Return slices of consecutive rows in which no column changes."""
+    """Return the slices of consecutive rows in which no column changes.
+
+    Args:
+        columns: arrays of the same length, (n,).
+    """
     bounds = [*np.flatnonzero(mark_changes(*columns)).tolist(), len(columns[0])]
     return [slice(start, stop) for start, stop in pairwise(bounds)]
 
@@ -109,7 +116,7 @@ def take_rows(
 
 @lru_cache(maxsize=1)
 def keep_freed_memory() -> None:
-    """Make the allocator keep freed blocks of up to 32 MiB.
+    """Make the allocator keep up to 32 MiB of freed memory for the next arrays.
 
     Source: mallopt(3), M_MMAP_THRESHOLD.
     """

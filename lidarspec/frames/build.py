@@ -44,9 +44,10 @@ def build(
     """Return the bytes of one frame; constants, counts and checksums are computed.
 
     Args:
-        value: a mapping of all fields, for example a result of `parse`, or None.
-        values: single fields by path, such as "flags.valid", which replace entries of `value`.
-        units: True if the values are physical; they are rounded to the resolution of the fields.
+        value: the fields by name, for example a result of `parse`; None if `values` has all fields.
+        values: further fields by path, such as "flags.valid"; they replace fields in `value`.
+        units: whether the values are physical values instead of raw values. They are rounded to the
+            resolution of the fields.
 
     Raises:
         UsageError: for a missing or unknown field, or a value that its field cannot represent.

@@ -46,7 +46,7 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
         UnknownField: for an argument that the command does not have.
         MissingField: for an argument that is missing.
         OutOfRange: for a value that exceeds the limits of the argument.
-        SpecError: for a field of the frame without a value or an argument.
+        SpecError: if neither the declaration nor an argument gives a field of the frame a value.
     """
     if name not in sensor.commands:
         raise UnknownCommand(name, sensor.commands, place=sensor.id)
@@ -62,7 +62,7 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
         if isinstance(value, Template):
             continue
         if path in command.filled:
-            filled = _resolve_filled(sensor, name, path, value, arguments.get(path))
+            filled = _resolve_filled_value(sensor, name, path, value, arguments.get(path))
         else:
             filled = copy.deepcopy(value)
         values = put_value(values, split_path(path), filled)
@@ -85,7 +85,8 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
         return build(sensor, command.frame, None, values)
     except MissingField as error:
         raise SpecError(
-            f"values and args have no value for field {error.path!r} of {command.frame}",
+            f"neither `values` nor `args` gives the field {error.path!r} of {command.frame} a"
+            " value",
             path=f"commands.{name}",
             sensor=sensor.id,
         ) from error
@@ -108,7 +109,7 @@ class ArgumentSlot:
         info: the field.
         length: the size of the field in bytes, or the number of elements of an array; None if it
             varies.
-        is_in_template: whether the argument is a part of a text.
+        is_in_template: whether the argument is inserted into a text (`Template`).
     """
 
     info: FieldInfo
@@ -233,7 +234,7 @@ def to_raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, 
     info = slot.info
     if isinstance(kind, Range):
         if isinstance(value, str) and info.labels:
-            value = _find_named(info, kind, value, f"{place}: {argument}")
+            value = _find_named_value(info, kind, value, f"{place}: {argument}")
         if not isinstance(value, int | float | np.number):
             raise UsageError(f"{place}: {argument} must be a number, not {value!r:.60}")
         if isinstance(kind, Choice) and value not in kind.names.values():
@@ -264,12 +265,12 @@ def list_choices(info: FieldInfo, kind: Range) -> dict[str, float]:
 
 
 def has_only_names(kind: Range, choices: Mapping[str, float]) -> bool:
-    """Return whether each number that an argument accepts has a name."""
+    """Return whether the names cover all numbers that an argument accepts."""
     return isinstance(kind, Choice) or len(choices) > kind.high - kind.low
 
 
-def _find_named(info: FieldInfo, kind: Range, name: str, place: str) -> float:
-    """Return the physical value that a name of the argument stands for."""
+def _find_named_value(info: FieldInfo, kind: Range, name: str, place: str) -> float:
+    """Return the physical value for a name that an argument accepts."""
     choices = list_choices(info, kind)
     if name not in choices:
         raise UsageError(f"{place} must be {' or '.join(choices) or 'a number'}, not {name!r:.60}")
@@ -285,10 +286,15 @@ def _to_raw_value(slot: ArgumentSlot, data: bytes) -> Any:
     return int.from_bytes(data, "big")
 
 
-def _resolve_filled(
+def _resolve_filled_value(
     sensor: SensorDescription, name: str, path: str, value: Count | Address | Port, given: Any
 ) -> Any:
-    """Return the raw value of a field that is filled in when a command is sent."""
+    """Return the raw value of a field that is filled in when a command is sent.
+
+    Args:
+        value: the declaration of what is filled in: a count, an address or a port.
+        given: the value to fill in; None for the first count, the address 0 or the port 0.
+    """
     if isinstance(value, Count):
         if given is None:
             return value.first

@@ -1,6 +1,6 @@
-"""Check which structs can be compiled.
+"""Check which structs can be compiled to layouts (`lidarspec.frames.layout`).
 
-A struct cannot be compiled if the offset of a part does not follow from header fields. construct
+A struct cannot be compiled if header fields do not determine the offsets of all fields. construct
 parses the frames of such a struct.
 """
 
@@ -11,7 +11,11 @@ from lidarspec.spec import tree
 
 
 class NotCompilableError(Exception):
-    """The offset of a part of a struct cannot be computed."""
+    """The reason why a struct cannot be compiled to layouts.
+
+    Attributes:
+        path: the path of the field or array that causes the error.
+    """
 
     def __init__(self, path: str, reason: str) -> None:
         self.path = path
@@ -51,7 +55,7 @@ def _check(node: tree.Node, path: str, *, is_in_array: bool) -> None:
     for formula in tree.formulas(node):
         _check_traced(formula)
         for ref in tree.refs(formula):
-            check_control(ref.info)
+            check_selector(ref.info)
     for info in tree.infos(node):
         _check_traced(info.rebuilt)
         _check_traced(info.default)
@@ -69,7 +73,7 @@ def _check(node: tree.Node, path: str, *, is_in_array: bool) -> None:
 
 def _check_alternatives(node: tree.When | tree.Select) -> None:
     """Check that the cases of an If or Switch have no conflicting names."""
-    # `build` finds the value of such a part by its name, before it selects an alternative.
+    # `build` finds the value of such a field by its name, before it selects an alternative.
     alternatives = tree.children(node)
     for alternative in alternatives:
         others = [other for other in alternatives if other is not alternative]
@@ -86,7 +90,7 @@ def _check_alternatives(node: tree.When | tree.Select) -> None:
 
 
 def _find_measured(node: tree.Node) -> str:
-    """Return the path of a part whose size is found by reading it; "" for other parts."""
+    """Return the path of a node whose size is found by reading it; "" for other nodes."""
     if isinstance(node, tree.PartSequence) and node.is_array:
         return node.axis
     if isinstance(node, tree.Blob) and node.ending is not None:
@@ -118,7 +122,7 @@ def _check_part(kind: tree.Kind, path: str) -> None:
     try:
         for formula in (kind.following, kind.until):
             for ref in () if formula is None else tree.refs(formula):
-                check_control(ref.info)
+                check_selector(ref.info)
         check_compilable(kind.root)
     except NotCompilableError as reason:
         raise NotCompilableError(f"{path}.{reason.path}".rstrip("."), reason.reason) from None
@@ -135,8 +139,8 @@ def _check_columns(root: tree.Node) -> None:
             )
 
 
-def check_control(info: tree.FieldInfo) -> None:
-    """Raise `NotCompilableError` for a field that a layout cannot depend on."""
+def check_selector(info: tree.FieldInfo) -> None:
+    """Raise `NotCompilableError` if layouts cannot depend on the value of a field."""
     if info.kind == "int" and info.axes and info.axes[-1].strip("[]") != info.path:
         raise NotCompilableError(
             info.path,

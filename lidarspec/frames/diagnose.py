@@ -1,6 +1,6 @@
 """Find the first fault in the bytes of one frame.
 
-The first fault is the fault that can be found with the fewest bytes of the frame.
+The first fault is the one that is found first if the frame is read byte by byte.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lidarspec.frames.layout import Condition, Layout, set_bits
 from lidarspec.frames.layout_tree import (
     HeaderWalk,
-    TooLongError,
+    InvalidLengthError,
     UnknownPartError,
     UnknownSelectorError,
 )
@@ -45,8 +45,8 @@ class Fault:
         expected, got: the expected and the actual value, as a text or number.
         end: the offset up to which the frame has to be read to find the fault.
         needed: the size of a field that is cut off, in bytes; 0 for all other faults.
-        is_bounded: whether the field is cut off by the end of the parts, not by the end of the
-            frame.
+        is_bounded: whether the field is in a part, and is cut off at the end of the sequence of
+            parts, before the end of the frame.
     """
 
     kind: str
@@ -84,7 +84,7 @@ class Fault:
             total = f" of {self.expected}"
         where = f"the frame ends at byte {self.end}{total}"
         if self.is_bounded:
-            where = f"the parts end at byte {self.end}"
+            where = f"the sequence of parts ends at byte {self.end}"
         if not self.needed:
             return f"{where}: {self.path or 'the first field'} is cut off"
         plural = "s" if self.needed != 1 else ""
@@ -146,7 +146,7 @@ def _find_value_fault(each: WireField) -> Fault | None:
 
 
 def _iter_layout_faults(examined: ExaminedFrame) -> Iterator[Fault]:
-    """Yield the wrong lengths and the false conditions of a complete frame and its parts."""
+    """Yield the faults of lengths and conditions in a complete frame and its parts."""
     layout = examined.layout
     if layout is None or layout.size > len(examined.data):
         return
@@ -167,7 +167,7 @@ def _describe_misfit(part: ExaminedFrame) -> Fault:
     if shortage is not None:
         return shortage
     end = part.start + len(part.data)
-    expected = "parts that fill the bytes of the array exactly"
+    expected = "parts that end where the sequence of parts ends"
     return Fault(LENGTH, part.prefix, part.start, expected, None, end)
 
 
@@ -238,7 +238,7 @@ def _insert_indices(path: str, axes: Sequence[str], indices: Sequence[int]) -> s
 
 
 def _find_end_fault(examined: ExaminedFrame, cut_off: WireField | None) -> Fault:
-    """Return the fault of a truncated frame, or of a header without a layout."""
+    """Return the fault of a truncated frame, or of a header that has no layout."""
     part = _find_open_part(examined)
     if part is not None and part.failure is not None:
         return _find_end_fault(part, cut_off)
@@ -250,7 +250,7 @@ def _find_end_fault(examined: ExaminedFrame, cut_off: WireField | None) -> Fault
         return Fault(CUT_OFF, path, end, None, end, end, is_bounded=examined.is_bounded)
     if failure is None or isinstance(failure, UnknownSelectorError):
         return _describe_shortage(examined, cut_off)
-    if isinstance(failure, TooLongError | UnknownPartError):
+    if isinstance(failure, InvalidLengthError | UnknownPartError):
         return _describe_refusal(examined, failure)
     raise failure
 
@@ -276,8 +276,10 @@ def _describe_shortage(examined: ExaminedFrame, cut_off: WireField | None) -> Fa
     return Fault(CUT_OFF, cut_off.block, cut_off.start, size, end, end, needed, is_bounded)
 
 
-def _describe_refusal(examined: ExaminedFrame, failure: TooLongError | UnknownPartError) -> Fault:
-    """Return the fault of a header without a layout."""
+def _describe_refusal(
+    examined: ExaminedFrame, failure: InvalidLengthError | UnknownPartError
+) -> Fault:
+    """Return the fault because of which a header has no layout."""
     end = examined.start + len(examined.data)
     path = f"{examined.prefix}.{failure}".strip(".") or "frame"
     if isinstance(failure, UnknownPartError):

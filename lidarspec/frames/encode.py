@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import MissingField, OutOfRange, UsageError
 from lidarspec.frames.field_paths import split_path
 from lidarspec.frames.layout import Layout, Leaf, Seal
-from lidarspec.frames.layout_tree import TooLongError, find_kinds
+from lidarspec.frames.layout_tree import InvalidLengthError, find_kinds
 from lidarspec.frames.measured_size import FOUND, MeasuredSize
 from lidarspec.frames.parts import LayoutLookup
 from lidarspec.frames.schema import Schema, find_count_field, make_schema
@@ -126,7 +126,7 @@ class _Encoder:
         return row.tobytes()
 
     def _measure_texts(self) -> None:
-        """Find the sizes of the texts that end at a mark."""
+        """Find the sizes of the texts that end at an end mark or with the datagram."""
         for path, ending in self._schema.endings.items():
             info = self._schema.fields[path]
             shown = self._make_shown_path(path)
@@ -149,7 +149,7 @@ class _Encoder:
         """Return the layout that the values of the header fields select."""
         try:
             return self._layouts.layout_for(self._read_header)
-        except TooLongError as fault:
+        except InvalidLengthError as fault:
             raise UsageError(
                 f"{self._place}: {self._prefix or fault or 'the frame'}: the frame would be"
                 f" longer than {self._layouts.limit} bytes with these values"
@@ -194,7 +194,7 @@ class _Encoder:
         return to_raw(info, value)
 
     def _find_implied(self, info: FieldInfo) -> Any:
-        """Return the value of a field that the caller omits; None if the field is required."""
+        """Return the constant, computed or default value of a field; None without one."""
         if info.const is not None:
             return info.const
         if info.rebuilt is not None and not info.is_enforced:
@@ -315,7 +315,7 @@ class _Encoder:
             self._add_value(part.info, names, below, found, 0)
 
     def _get_element(self, array: Any, index: int, shown: str) -> Any:
-        """Return an element of an array in a bit block."""
+        """Return an element of an array of bit fields; None if the array is missing."""
         if array is None:
             return None
         if not isinstance(array, list | tuple | bytes):
@@ -406,7 +406,7 @@ class _Encoder:
         leaf.store(row, values)
         if leaf.info.kind == "float":
             self._check_floats(leaf, column, values)
-            self._store_payloads(row, leaf, column)
+            self._store_nan_bits(row, leaf, column)
 
     def _check_floats(self, leaf: Leaf, column: list[Any], values: NDArray[Any]) -> None:
         """Raise `OutOfRange` if a finite number became infinite."""
@@ -417,14 +417,14 @@ class _Encoder:
             number = float(wide[lost][0])
             raise OutOfRange(leaf.info.path, number, -largest, largest, place=self._place)
 
-    def _store_payloads(self, row: NDArray[np.uint8], leaf: Leaf, column: list[Any]) -> None:
+    def _store_nan_bits(self, row: NDArray[np.uint8], leaf: Leaf, column: list[Any]) -> None:
         """Write the original bits of each NaN that was parsed from a frame."""
         for value, offset in zip(column, leaf.offsets(), strict=True):
             if isinstance(value, WireNaN) and len(value.raw) == leaf.size:
                 row[0, offset : offset + leaf.size] = np.frombuffer(value.raw, np.uint8)
 
     def _is_absent(self, seal: Seal, row: NDArray[np.uint8]) -> bool:
-        """Return whether the given checksum means that none was computed (`Seal.absent`)."""
+        """Return whether the caller gives a checksum that means "none" (`Seal.absent`)."""
         if not seal.absent or any(
             get_member(self._given, leaf.info.path, None) is None for leaf in seal.leaves
         ):
@@ -509,7 +509,10 @@ def fill_counts(given: Container, table: Schema) -> None:
 def remove_computed_count(
     formula: Formula | None, given: Container, fields: Mapping[str, FieldInfo]
 ) -> None:
-    """Remove a formula's count field from `given` if the field is always computed."""
+    """Remove the count field of a formula from `given` if the field is enforced.
+
+    An enforced field must contain the actual count, so a given value is not used.
+    """
     path = None if formula is None else find_count_field(formula, fields)
     if path is not None and fields[path].is_enforced:
         holder, name = _find_holder(given, path)
@@ -523,9 +526,9 @@ def set_count(
     fields: Mapping[str, FieldInfo],
     axis: str,
 ) -> None:
-    """Set the count field of a formula, so that the formula has a given value.
+    """Set the count field of a formula, if the field has no value yet.
 
-    A field that already has a value is not changed.
+    The formula then results in `value`.
 
     Args:
         axis: the path of the array or of the parts, for messages.

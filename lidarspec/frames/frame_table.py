@@ -1,8 +1,8 @@
 """Tables: frames of one type as columns of raw values, in stream order.
 
 `CompiledTable` loads fields from the bytes of frames. `ParsedTable` collects fields that construct
-has parsed. Arrays of variable length are padded with zeros; `counts` returns their lengths. Parts
-(frames within a frame) have a table of their own.
+has parsed. Arrays of variable length are padded with zeros; `counts` returns their lengths. Each
+kind of parts (frames within a frame) has a table of its own.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ VARYING_LENGTH = "the inner arrays of one frame have different lengths, so they 
 
 
 class Table(Protocol):
-    """The raw columns of n frames of one type."""
+    """The raw columns of n frames of one type.
+
+    The argument `path` is the path of a field, and `axis` is the path of an array.
+    """
 
     schema: Schema
 
@@ -64,7 +67,11 @@ class Table(Protocol):
         """Return a table of the frames at these indices, in this order."""
 
     def parts(self, axis: str, kind: str = "") -> tuple[Table, NDArray[np.intp]]:
-        """Return the parts of one kind in stream order, and the row of each part's frame."""
+        """Return the parts of one kind in stream order, and the row of each part's frame.
+
+        Args:
+            axis: the path of the sequence of parts.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -659,7 +666,10 @@ def _collect_elements(parsed: list[Any], names: list[str], axes: int) -> list[An
 
 
 def _find_present(value: Any) -> Any:
-    """Return whether a value, or each element of nested lists, is not None."""
+    """Return whether a value is not None; for nested lists, return nested lists.
+
+    A list in which no value is None becomes True.
+    """
     if not isinstance(value, list):
         return value is not None
     present = [_find_present(part) for part in value]
@@ -682,7 +692,14 @@ def _copy_value(column: NDArray[Any], index: int, value: Any) -> None:
 
 
 def _collect_lengths(value: Any, names: list[str], brackets: int) -> set[int]:
-    """Return all lengths that an array has in one parsed frame."""
+    """Return the lengths that an array has in one parsed frame, each once.
+
+    There are several if the array is in the elements of another array.
+
+    Args:
+        names: the names in the path from `value` to the array.
+        brackets: the number of arrays directly around the array, as in ``names[][]``.
+    """
     if isinstance(value, list) and (names or brackets):
         below = brackets if names else brackets - 1
         return {length for part in value for length in _collect_lengths(part, names, below)}

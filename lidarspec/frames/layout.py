@@ -1,8 +1,8 @@
 """Layouts: the positions of all fields of a frame, for loading and storing values.
 
 A `Layout` describes the frames of one header variant. `lidarspec.frames.layout_tree` makes it from
-the frame tree. A `Leaf` is the position of one field. A `Seal` is a checksum with the bytes that it
-covers. Most functions handle many frames at once, given as rows of bytes.
+the frame tree. A `Leaf` is the position of one field. A `Seal` is a checksum: the fields that store
+it, and the bytes that it covers. Most functions handle many frames at once, given as rows of bytes.
 """
 
 from __future__ import annotations
@@ -105,8 +105,10 @@ class Leaf:
         shape: the number of elements along each array that contains the field.
         strides: the distance from one element to the next along each array, in bytes. An array
             inside a bit block has no stride.
-        wire: the dtype with byte order if NumPy can read the field directly, else None.
-        elements: the bits of each element if `wire` is None.
+        wire: the dtype and byte order of the field in the frame; None if NumPy cannot read it
+            directly.
+        elements: if `wire` is None, the bits of the field, or of each element of its array inside a
+            bit block.
         size: the size of one element, or of the bit block that contains the field, in bytes.
     """
 
@@ -144,7 +146,7 @@ class Leaf:
         offsets: NDArray[np.intp],
         stops: NDArray[np.intp] | None = None,
     ) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
-        """Read an integer field in the candidates at these offsets.
+        """Read an integer field in the candidates (possible frames) at these offsets.
 
         The field must not be in an array.
 
@@ -165,7 +167,10 @@ class Leaf:
         return which, self._from_start.load(gather_rows(buffer, starts, self.size))
 
     def read_first(self, frame: bytes | memoryview) -> int | None:
-        """Return the value of the field; None if the bytes end in or before the field."""
+        """Return the value of the field, given the first bytes of a frame.
+
+        Returns None if the bytes end in or before the field.
+        """
         if self.offset + self.size <= len(frame):
             return self.read_scalar(frame)
         return None
@@ -184,7 +189,7 @@ class Leaf:
                 view[...] = (view & np.uint8(~part.mask & 0xFF)) | bits
 
     def offsets(self, depth: int | None = None) -> list[int]:
-        """Return the offset of each element, row by row.
+        """Return the offset of each element, in C order.
 
         Args:
             depth: the number of outer arrays to iterate over; None for all arrays outside a
@@ -196,7 +201,7 @@ class Leaf:
         return offsets
 
     def raw(self, given: Sequence[Any]) -> NDArray[Any]:
-        """Return physical values of n frames as raw values, (n, ...)."""
+        """Convert the physical values of n frames to raw values, (n, ...)."""
         if self.info.kind == "bytes":
             size = self.shape[-1]
             given = [
@@ -332,14 +337,15 @@ class Leaf:
 
 @dataclass(frozen=True, eq=False)
 class Derivation:
-    """A value without bytes of its own, in frames of one layout.
+    """A value without bytes of its own, such as a `Computed`, in frames of one layout.
 
     Attributes:
         shape: the number of elements along each array that contains the value.
         strides: the difference between the values of consecutive elements along each array.
         formula: a formula of fields of the frame; None if the value is computed from `start`.
         start: the value of the first element.
-        picked: the index of the selected element in each array; None for all elements.
+        picked: if elements are selected, the index in each array, which is None for all elements of
+            this array; otherwise ().
     """
 
     info: FieldInfo
@@ -443,8 +449,8 @@ class Seal:
         """Compute the checksums of the frames, (n,).
 
         Args:
-            sums: a faster function; the algorithm of the seal is used if it is None or returns
-                None.
+            sums: a function that computes some checksums faster. If it is None or returns None,
+                the algorithm of the seal is used.
         """
         values = None if sums is None else sums(self, rows)
         if values is None:
@@ -592,12 +598,14 @@ def find_passing(test: FrameTest, leaves: Mapping[str, Leaf], rows: Bytes2D) -> 
 class LayoutRefusal:
     """The reason why frames with a certain header have no layout.
 
-    Without an `error` or a wrong constant, the frame is too long.
+    There are three reasons: a plugin expression fails, a constant is wrong, or else the lengths in
+    the header are invalid.
 
     Attributes:
-        error: the error of a plugin expression that failed.
+        error: the error of the plugin expression; None for the other reasons.
         has_wrong_constant: whether a constant is wrong.
-        constants: if the frame is too long, the constants before the part that is too long.
+        constants: for invalid lengths, the constants before the field that makes the frame too
+            long, as (mask, value) by offset. They may be wrong as well.
     """
 
     error: PluginError | None = None
@@ -614,12 +622,12 @@ class Layout:
         leaves: the position of each field, by path.
         constants: the constant bits, as (mask, value) by offset.
         seals: the checksums, inner checksums first.
-        places: the byte range of each named part outside arrays.
+        places: the byte range of each named field, struct and array outside other arrays, by path.
         branches: the branch that each `When` and `Select` takes.
-        following: the fields whose values follow from the header, each with its value.
+        following: the fields whose values the header implies, each with its value.
         lengths: the length of each array, by path; 0 for an array inside an empty array.
         regions: the `Region` of each sequence of parts (frames within the frame), by path.
-        held: the bits of the fields that declare the sizes of parts, as (mask, value) by offset.
+        held: the bits that the fields with `SizeOf` must have, as (mask, value) by offset.
         conditions: the conditions that the values of fields have to meet.
         derived: the `Derivation` of each value without bytes of its own, by path; a `Leaf` for a
             copy of a field.
@@ -701,7 +709,7 @@ class Layout:
             seal.fill(rows)
 
     def seal_header(self, rows: Bytes2D) -> None:
-        """Write constants, and values that follow from the header, into rows of bytes."""
+        """Write constants, and values that the header implies, into rows of bytes."""
         for leaf, value in self.following:
             leaf.store(rows, value)
         set_bits(rows, self.known)
@@ -728,7 +736,7 @@ Word = tuple[int, np.dtype[Any], Any, Any]
 
 
 def sort_constants(constants: Mapping[int, tuple[int, int]]) -> Marks:
-    """Return constant bytes in a list, whole bytes before single bits."""
+    """Return constants in a list: first the bytes in which all bits are constant."""
     constant_bytes = [(offset, mask, value) for offset, (mask, value) in constants.items()]
     return tuple(sorted(constant_bytes, key=lambda mark: (mark[1] != 0xFF, mark[0])))
 

@@ -1,11 +1,12 @@
 """Compute the layouts of a frame type: the offset of each field, for each variant of the header.
 
-A layout may depend on header fields, such as a count. These fields are called *selectors* here.
-`find_layout` returns the layout for given values of the selectors.
+A layout may depend on header fields, such as a count, and on sizes that are found by reading the
+content (`lidarspec.frames.measured_size`). Both are called *selectors* here. `find_layout` returns
+the layout for given values of the selectors.
 
 `HeaderTree` is a decision tree that caches layouts. An inner node is a selector, a branch is a
-value of the selector, and a leaf is a `Layout`, or a `LayoutRefusal` with the reason why there is
-no layout.
+value of the selector, and an end node is a `Layout`, or a `LayoutRefusal` with the reason why there
+is no layout.
 """
 
 from __future__ import annotations
@@ -35,21 +36,22 @@ from lidarspec.spec.description import Frame
 
 
 class UnknownSelectorError(Exception):
-    """The layout depends on a field, or a size, that is not known yet."""
+    """The layout depends on a selector whose value is not known yet."""
 
     def __init__(self, leaf: Leaf | MeasuredSize) -> None:
         self.leaf = leaf
         super().__init__(leaf.info.path)
 
 
-class TooLongError(Exception):
-    """The header has an invalid length.
+class InvalidLengthError(Exception):
+    """The lengths in the header are invalid.
 
     The frame would be longer than the maximum of the frame type, or have no bytes.
 
     Attributes:
-        path: the path of the part that is too long.
-        number: the invalid count or length; None if the sum of all parts is too long.
+        path: the path of the field, struct or array that makes the frame too long; "" if the frame
+            would have no bytes.
+        number: the invalid count or length; None if only the sum of the lengths is invalid.
     """
 
     def __init__(self, path: str, number: int | None = None) -> None:
@@ -69,16 +71,16 @@ class CutOffError(Exception):
 def find_layout(
     root: tree.Node, values: Mapping[str, int], limit: int, given: Mapping[str, int] | None = None
 ) -> Layout:
-    """Return the layout of the frames with these values of header fields.
+    """Return the layout of the frames with these values of the selectors.
 
     Args:
-        values: the raw values of the fields that the layout depends on, by path.
+        values: the raw values of the selectors, by path.
         limit: the maximum size of a frame, in bytes.
         given: for parts, the raw values of fields of the outer frame, by path.
 
     Raises:
-        UnknownSelectorError: if the layout depends on a field that is not in `values`.
-        TooLongError: if the frame would be longer than `limit`, or have no bytes.
+        UnknownSelectorError: if the layout depends on a selector that is not in `values`.
+        InvalidLengthError: if the frame would be longer than `limit`, or have no bytes.
         UnknownPartError: if the constants of a part match no kind of parts.
         NotCompilableError: if only construct can parse the struct.
         Exception: any error of a formula with these values.
@@ -90,12 +92,12 @@ def walk_layout(walk: HeaderWalk, root: tree.Node) -> Layout:
     """Complete a walk through the tree, and return the layout."""
     walk.visit(root, "")
     if not walk.cursor:
-        raise TooLongError("")
+        raise InvalidLengthError("")
     return walk.layout()
 
 
-def find_prefix(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
-    """Return the constants at offsets that depend on no header field.
+def find_fixed_constants(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
+    """Return the constants at offsets that do not depend on header fields.
 
     The constants are given as (mask, value) by offset.
     """
@@ -125,6 +127,7 @@ class HeaderWalk:
     request: ValueRequest = _raise_unknown
     #: The size of the frame in bytes if the frame is complete; None if more bytes may follow.
     frame_size: int | None = None
+    #: The offset of the next node of the tree.
     cursor: int = 0
     leaves: dict[str, Leaf] = field(default_factory=dict)
     constants: dict[int, tuple[int, int]] = field(default_factory=dict)
@@ -139,7 +142,7 @@ class HeaderWalk:
     conditions: dict[tree.FieldInfo | tree.Check, Condition] = field(default_factory=dict)
     #: The values without bytes of their own, by path.
     derived: dict[str, Leaf | Derivation] = field(default_factory=dict)
-    #: The offset of each part. For a part in arrays, it is the offset of the first element.
+    #: The offset of each node, by path. For a node in arrays, it is that of the first element.
     starts: dict[str, int] = field(default_factory=dict)
     #: The number of elements without bytes in all arrays.
     empty: int = 0
@@ -202,10 +205,10 @@ class HeaderWalk:
     def visit(
         self, node: tree.Node, path: str, shape: tuple[int, ...] = (), strides: tuple[int, ...] = ()
     ) -> None:
-        """Add a part and move the cursor to its end.
+        """Add a node of the tree at the cursor, and move the cursor to its end.
 
         Args:
-            shape: the lengths of the arrays that contain the part.
+            shape: the lengths of the arrays that contain the node.
             strides: the strides of these arrays.
         """
         start = self.starts[path] = self.cursor
@@ -232,13 +235,13 @@ class HeaderWalk:
             case tree.Check() if 0 not in shape:
                 self.conditions[node] = Condition.of(node)
             case tree.Never():
-                raise TooLongError(path)
+                raise InvalidLengthError(path)
             case tree.Derived():
                 self._add_derived(node, path, shape, strides)
             case tree.Opaque():
                 raise NotCompilableError(node.info.path, node.reason)
         if self.cursor > self.limit:
-            raise TooLongError(path)
+            raise InvalidLengthError(path)
         if self.frame_size is not None and self.cursor > self.frame_size:
             raise CutOffError(path)
         if path and not shape:
@@ -269,7 +272,7 @@ class HeaderWalk:
         depth = len(strides)
         self.empty += 0 if size else math.prod(shape) * count
         if start + size * count > self.limit or self.empty > self.limit:
-            raise TooLongError(path)
+            raise InvalidLengthError(path)
         for leaves in (self.leaves, self.derived):
             _set_stride(leaves, node.axis, depth, size)
         for offset in [offset for offset in self.constants if offset >= start]:
@@ -280,7 +283,7 @@ class HeaderWalk:
     def _add_derived(
         self, node: tree.Derived, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
-        """Add a value without bytes of its own."""
+        """Add a value without bytes of its own, such as a `Computed`."""
         info = node.info
         match node.kind:
             case "computed":
@@ -337,9 +340,9 @@ class HeaderWalk:
         else:
             size = int(self._evaluate(tree.Ref(node.total.path, node.total)))
         if size == -FAILED:
-            raise ValueError(f"an expression in {path} fails")
+            raise ValueError(f"an expression in the parts {path} raises an exception")
         if size < 0:
-            raise UnknownPartError(path) if size == -CONSTANT else TooLongError(path)
+            raise UnknownPartError(path) if size == -CONSTANT else InvalidLengthError(path)
         self.regions[node.axis] = region = replace(region, size=size)
         self.parts[node.total.path] = PartsSize(node.total, region)
         self.cursor += size
@@ -456,7 +459,10 @@ class HeaderWalk:
         self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent, self.cursor))
 
     def _find_size_bits(self) -> dict[int, tuple[int, int]]:
-        """Return (mask, value) of the fields that contain the sizes of parts, by offset."""
+        """Return the bits that the fields with `SizeOf` must have.
+
+        The bits are given as (mask, value) by offset.
+        """
         rows = np.zeros((2, self.cursor), np.uint8)
         held_leaves = [leaf for leaf in self.leaves.values() if leaf.info.is_enforced]
         for leaf in held_leaves:
@@ -464,7 +470,7 @@ class HeaderWalk:
             if rebuilt is not None:
                 value = operator.index(tree.evaluate(rebuilt, self._read_known))
                 if not low <= value <= high:
-                    raise TooLongError(leaf.info.path, value)
+                    raise InvalidLengthError(leaf.info.path, value)
                 leaf.store(
                     rows,
                     np.array([value, -1 if low else high], leaf.info.dtype).reshape(
@@ -475,7 +481,7 @@ class HeaderWalk:
         return {offset: (int(rows[1, offset]), int(rows[0, offset])) for offset in offsets}
 
     def _iter_following(self) -> Iterator[tuple[Leaf, int]]:
-        """Yield each field whose value follows from the header, with the value."""
+        """Yield the fields whose values the header implies, each with its value."""
         for leaf in self.leaves.values():
             if leaf.info.rebuilt is not None and not leaf.info.is_enforced and not leaf.shape:
                 # construct evaluates other fields when a frame is built.
@@ -494,7 +500,7 @@ class HeaderWalk:
     def _evaluate_count(self, formula: tree.Formula, path: str) -> int:
         count = operator.index(self._evaluate(formula))
         if not 0 <= count <= self.limit:
-            raise TooLongError(path, count)
+            raise InvalidLengthError(path, count)
         return count
 
 
@@ -531,21 +537,20 @@ MAX_SEARCHED_VALUES = 4
 class HeaderNode:
     """A node of a `HeaderTree`, which has a selector or a result.
 
-    A selector is a header field, or a measured size, that the layout depends on.
-
     Attributes:
         values: the raw values of the selectors above this node, by path.
-        above: the parent node; None for the root.
+        parent: the parent node; None for the root.
         leaf: the selector of this node; None if it is not known yet, or if the node has a result.
-        before: all fields before `leaf`, by path.
-        constants: the constants before `leaf`, or before the end of a truncated frame.
+        before: all fields before the selector, by path.
+        constants: the constants before the selector, or before the end of a truncated frame.
         least: the known minimum size of a frame with these values, in bytes; 0 if not known.
-        value_classes: the values of `leaf` that lead to different layouts.
+        value_classes: maps the values of the selector that have the same layout to one value; None
+            if the selector is not known yet, or is a measured size.
         result: the layout or the refusal; None if not known yet.
     """
 
     values: Mapping[str, int] = field(default_factory=dict)
-    above: HeaderNode | None = None
+    parent: HeaderNode | None = None
     leaf: Leaf | MeasuredSize | None = None
     before: Mapping[str, Leaf] = field(default_factory=dict)
     constants: Mapping[int, tuple[int, int]] = field(default_factory=dict)
@@ -580,8 +585,8 @@ class _ValueClasses:
 
     Attributes:
         limits: the lowest and the highest value of the field.
-        rises: the value above which a larger value never makes the frame shorter; None if
-            unknown.
+        monotonic_from: the value from which on a larger value never makes the frame shorter; None
+            if unknown.
     """
 
     # Random bytes in place of a header can contain billions of lengths or keys. The tree stays
@@ -591,7 +596,7 @@ class _ValueClasses:
     high: int
     keys: frozenset[int] = frozenset()  # if not empty, all other values are mapped to `other`
     other: int = 0
-    rises: int | None = None
+    monotonic_from: int | None = None
 
     @classmethod
     def of(cls, info: tree.FieldInfo, root: tree.Node, limit: int) -> _ValueClasses:
@@ -641,17 +646,20 @@ class _ValueClasses:
             # The refusal of a frame with too many parts depends on the parts, not only on their
             # number.
             if any(isinstance(node, tree.PartSequence) for node, _ in asking):
-                rises = None
+                monotonic_from = None
             else:
-                rises = max(firsts) + low + 1
+                monotonic_from = max(firsts) + low + 1
             return cls(
-                info.limits, max(min(firsts) + low, low), min(max(lasts) + low, high), rises=rises
+                info.limits,
+                max(min(firsts) + low, low),
+                min(max(lasts) + low, high),
+                monotonic_from=monotonic_from,
             )
         return cls(info.limits, low, high)
 
     def limit_to(self, value: int) -> _ValueClasses:
-        """Limit the values to `value` if no larger value makes the frame shorter."""
-        if self.rises is not None and self.rises <= value < self.high:
+        """Let `value` represent all larger values, if none makes the frame shorter."""
+        if self.monotonic_from is not None and self.monotonic_from <= value < self.high:
             return replace(self, high=value)
         return self
 
@@ -705,10 +713,13 @@ def _evaluate_with(formula: tree.Formula, value: int) -> int:
 
 
 class _CandidateSet:
-    """The candidates in a buffer that are passed to `HeaderTree.classify`.
+    """The candidates that `HeaderTree.classify` groups.
+
+    A candidate is an offset in a buffer at which a frame may start.
 
     Attributes:
-        refuted: the indices of incomplete or too long candidates with a wrong constant.
+        refuted: the indices of the candidates that have no layout, because the header is incomplete
+            or the frame would be too long, and have a wrong constant.
     """
 
     def __init__(
@@ -724,8 +735,8 @@ class _CandidateSet:
         self._limit = limit
         self.refuted: list[NDArray[np.intp]] = []
 
-    def cut_longest(self, which: NDArray[np.intp]) -> bytes | memoryview:
-        """Return the available bytes of the longest candidate, at most `limit`."""
+    def get_longest_bytes(self, which: NDArray[np.intp]) -> bytes | memoryview:
+        """Return the available bytes of the longest of some candidates, at most `limit`."""
         first = which.item(0)
         if self.stops is not None and len(which) > 1:
             first = which.item((self.stops[which] - self._offsets[which]).argmax())
@@ -764,7 +775,7 @@ class _CandidateSet:
     ) -> NDArray[np.bool_]:
         """Return whether each candidate has a wrong constant in its available bytes, (n,)."""
         if len(which) == 1:  # the usual case for random headers, which differ
-            data = self.cut_longest(which)
+            data = self.get_longest_bytes(which)
             return np.array([_is_refuted(constants, data)])
         offsets = self._offsets[which]
         stops = len(self._buffer) if self.stops is None else self.stops[which]
@@ -800,7 +811,7 @@ class HeaderTree:
 
     @functools.cached_property
     def _prefix(self) -> dict[int, tuple[int, int]]:
-        return find_prefix(self.root, self.limit)
+        return find_fixed_constants(self.root, self.limit)
 
     def classify(
         self,
@@ -835,11 +846,12 @@ class HeaderTree:
     def group_by_layout(
         self, number: int, read: Reader, places: _CandidateSet | None = None
     ) -> list[Group]:
-        """Group candidates by layout.
+        """Group candidates by layout, given a function that reads their fields.
 
         Args:
-            read: a function that reads the field of a node for some candidates.
-            places: the bytes of the candidates, if they are available.
+            number: the number of candidates.
+            read: the function, which reads the field of a node in some candidates.
+            places: the candidates in a buffer; None if there is no buffer.
         """
         self._limit_cache()
         groups: list[Group] = []
@@ -848,10 +860,12 @@ class HeaderTree:
             node, which = stack.pop()
             if len(which) == 1 and places is not None:
                 node = self._find_end(
-                    places.cut_longest(which), node, is_whole_frame=places.stops is not None
+                    places.get_longest_bytes(which), node, is_whole_frame=places.stops is not None
                 )
             elif node.leaf is None and node.result is None:
-                data: bytes | memoryview = b"" if places is None else places.cut_longest(which)
+                data: bytes | memoryview = (
+                    b"" if places is None else places.get_longest_bytes(which)
+                )
                 self._explore(
                     node, data, is_whole_frame=places is not None and places.stops is not None
                 )
@@ -883,7 +897,7 @@ class HeaderTree:
             leaves = self._root.result.leaves
         else:
             leaves = self._root.before
-        return tuple(leaves.values()), find_prefix(self.root, self.limit)
+        return tuple(leaves.values()), find_fixed_constants(self.root, self.limit)
 
     def find_common_layout(self, rows: NDArray[np.uint8]) -> Layout | None:
         """Return the common layout of rows of bytes; None if their layouts differ."""
@@ -934,7 +948,7 @@ class HeaderTree:
         return self._find_end(frame, self._root).result
 
     def layout_for(self, read: Callable[[Leaf | MeasuredSize], int]) -> Layout:
-        """Return the layout for given values of header fields."""
+        """Return the layout for the values of the selectors, which `read` returns."""
         self._limit_cache()
         node = self._root
         while node.result is None:
@@ -995,7 +1009,7 @@ class HeaderTree:
         except CutOffError:
             node.constants = self._select_new_constants(walk)
             node.least = walk.cursor
-        except TooLongError:
+        except InvalidLengthError:
             node.result = LayoutRefusal(constants=self._select_new_constants(walk))
         except UnknownPartError:
             node.result = LayoutRefusal(has_wrong_constant=True)
@@ -1003,18 +1017,19 @@ class HeaderTree:
             raise
         except Exception as error:
             node.result = LayoutRefusal(PluginError.of(error, "struct"))
-        above = node.above
+        parent = node.parent
         if (
-            above is not None
-            and above.value_classes is not None
+            parent is not None
+            and parent.value_classes is not None
             and isinstance(node.result, LayoutRefusal)
             and not node.result.error
         ):
-            above.value_classes = above.value_classes.limit_to([*node.values.values()][-1])
+            parent.value_classes = parent.value_classes.limit_to([*node.values.values()][-1])
         return node
 
     def _select_new_constants(self, walk: HeaderWalk) -> dict[int, tuple[int, int]]:
-        """Return the constants of a walk that the search has not checked."""
+        """Return the constants of a walk, except those at fixed offsets."""
+        # The candidates that a search finds have the constants at fixed offsets.
         return {
             offset: bits
             for offset, bits in walk.constants.items()
@@ -1036,7 +1051,7 @@ def find_kinds(
     """Return the possible kinds of parts, given the values of fields of the outer frame."""
     values = dict(given)
     return tuple(
-        PartKind(kind, HeaderTree(kind.root, limit, values), find_prefix(kind.root, limit))
+        PartKind(kind, HeaderTree(kind.root, limit, values), find_fixed_constants(kind.root, limit))
         for kind in node.kinds
     )
 
@@ -1050,7 +1065,7 @@ def frame_layouts(frame: Frame) -> HeaderTree | NotCompilableError:
         if frame.wire is not None and endings:
             raise NotCompilableError(
                 next(iter(endings)),
-                "a frame with `wire` cannot contain bytes up to a terminator",
+                "a frame type with `wire` cannot have a field that extends to a terminator",
             )
         return HeaderTree(frame.tree, frame.max_struct_bytes)
     except NotCompilableError as reason:

@@ -1,6 +1,7 @@
 """Sizes that are found by reading the content of a frame, not its header.
 
-An example is the size of a text that ends at a mark.
+An example is the size of a text that ends at a mark, such as a zero byte, which is called the end
+mark here.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ CUT_OFF = 1
 #: The status of a frame if the content has an invalid length.
 LENGTH = 2
 
-#: The number of bytes that are searched in each frame by itself, in units of the size of the mark.
+#: The number of bytes that are searched in each frame by itself, in units of the size of the end
+#: mark.
 #: Most texts are shorter.
 FIRST_WINDOW_MARKS = 32
 #: The maximum number of bytes that are searched in one step, of all frames together.
@@ -36,10 +38,10 @@ MAX_WINDOW_BYTES = 1 << 16
 class MeasuredSize(ABC):
     """A size that is found by reading the content of a frame.
 
-    The class has the methods of a header field (`Leaf`).
+    Like a header field, it can be a selector of layouts, so it has the same methods as a `Leaf`.
 
     Attributes:
-        info: the size as a field.
+        info: describes the size like a field that contains the size.
     """
 
     info: tree.FieldInfo
@@ -60,14 +62,14 @@ class MeasuredSize(ABC):
 
         Returns:
             The indices of the candidates in which the size was found (None for all candidates), and
-            the sizes. For invalid content, the size is the status of the frame with a minus sign.
+            the sizes. For invalid content, the size is a status such as `LENGTH` with a minus sign.
         """
 
     @abstractmethod
     def load(self, rows: Bytes2D) -> NDArray[Any]:
         """Return the size in each frame, given as a row of bytes, (n,).
 
-        For invalid content, the size is the status of the frame with a minus sign.
+        For invalid content, the size is a status such as `LENGTH` with a minus sign.
         """
 
     def read_first(self, frame: bytes | memoryview) -> int | None:
@@ -80,11 +82,12 @@ class MeasuredSize(ABC):
 
 @dataclass(frozen=True, eq=False)
 class TextSize(MeasuredSize):
-    """The size of bytes that end at a mark, or at the end of the datagram.
+    """The size of a text that extends to an end mark, or to the end of the datagram.
 
     Attributes:
-        ending: the mark.
-        start: the offset of the bytes in a frame.
+        ending: the end mark, or the end of the datagram.
+        start: the offset of the text in a frame.
+        limit: the maximum size of a frame, in bytes.
     """
 
     ending: tree.Ending
@@ -179,7 +182,7 @@ class TextSize(MeasuredSize):
         """Return whether each group of bytes is equal to the end mark, (...).
 
         Args:
-            units: the groups, which have the size of the mark, (..., size).
+            units: the groups, which have the size of the end mark, (..., size).
         """
         mark = np.frombuffer(self.ending.mark, np.uint8)
         mask = np.frombuffer(self.ending.mask, np.uint8)

@@ -1,4 +1,4 @@
-"""Format physical values with the decimals that their fields can distinguish."""
+"""Format physical values with the decimals that tell the values of a field apart."""
 
 from __future__ import annotations
 

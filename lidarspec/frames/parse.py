@@ -152,7 +152,10 @@ def _parse_invalid(
         return frame, _parse_unverified(sensor, frame, data)
     if not sensor.frames:
         raise UnknownFrame(
-            "data", (), place=sensor.id, hint="; configure the sensor with its file first"
+            "data",
+            (),
+            place=sensor.id,
+            hint="; the sensor requires its configuration file: see sensor.configure",
         )
     faults = [_find_fault(sensor, name, data) for name in sensor.frames]
     if not verify:
@@ -196,7 +199,8 @@ def _find_field_fault(
     """Return the first fault of a frame's fields as an error."""
     fault = _run_search(sensor, name, diagnose.find_fault, examined)
     if fault is None:  # a checksum of a plugin returned a different value this time
-        return WireError("the frame is invalid", sensor=sensor.id, frame=name, data=data)
+        reason = "the frame was found to be invalid, but a second check has found no fault"
+        return WireError(reason, sensor=sensor.id, frame=name, data=data)
     return _to_wire_error(sensor, name, data, fault, to_wire_offset)
 
 
@@ -206,10 +210,10 @@ def _run_search(
     find: Callable[[ExaminedFrame], diagnose.Fault | None],
     examined: ExaminedFrame,
 ) -> diagnose.Fault | None:
-    """Return the fault that the search `find` returns; None without a fault.
+    """Return the fault that the search `find` returns, or None.
 
     Raises:
-        SpecError: if an expression or a checksum of the struct raises.
+        SpecError: if an expression or a checksum of the struct raises an exception.
     """
     try:
         return find(examined)
@@ -283,17 +287,17 @@ def unpack(root: Node, layout: Layout, frame: bytes) -> Any:
 #: The byte orders in which a bit block can be read as one number.
 BYTE_ORDERS: tuple[Literal["little"], Literal["big"]] = ("little", "big")
 
-#: A function that reads one part of a frame. It returns one value for each element of the arrays
-#: that contain the part, row by row. Its argument is the bytes of the frame or, for a part of a bit
-#: block, the blocks that were read as numbers.
+#: A function that reads one node of the tree, such as a field or a struct. It returns one value for
+#: each element of the arrays that contain the node, in C order. Its argument is the bytes of the
+#: frame or, for a number in a bit block, the blocks that were read as numbers.
 Reader = Callable[[Any], Sequence[Any]]
 
 
 def _make_reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
-    """Return the reader of a part, for frames of one layout.
+    """Return the reader of a node of the tree, for frames of one layout.
 
     Args:
-        count: the number of instances of the part in a frame.
+        count: the number of elements of the arrays that contain the node.
     """
     if count == 0:
         return _read_no_values
@@ -604,7 +608,10 @@ def find_frame_layout(
 
 
 def _rank_fault(sensor: SensorDescription, fault: WireError) -> tuple[int, int]:
-    """Return a sort key, which is higher for a fault that is later in the frame."""
+    """Return a sort key, which is higher for a fault that is later in the frame.
+
+    The frame type with the last fault is the likeliest type.
+    """
     if sensor.frames[fault.frame].wire is not None:
         return 0, fault.offset
     layout = find_frame_layout(sensor, fault.frame, fault.data)

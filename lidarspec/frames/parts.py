@@ -60,7 +60,7 @@ class LayoutLookup(Protocol):
         """
 
     def layout_for(self, read: Callable[[Leaf | MeasuredSize], int]) -> Layout:
-        """Return the layout for given values of header fields."""
+        """Return the layout for the values of header fields, which `read` returns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,12 +106,14 @@ class PartKind:
 
 @dataclass(frozen=True)
 class PartRule:
-    """The number and the sizes of the parts, for one header.
+    """The number and the sizes of the parts that a header declares.
+
+    If `count` and `within` are None, each part determines whether another part follows.
 
     Attributes:
-        count: the number of parts, or None.
-        size: the size of the first part in bytes, or None.
-        within: the total size of all parts in bytes, or None.
+        count: the number of parts; None if it is not declared.
+        size: the size of the first part in bytes; None if it is not declared.
+        within: the total size of all parts in bytes; None if it is not declared.
     """
 
     count: int | None = None
@@ -175,7 +177,7 @@ class Region:
 
     @property
     def is_measured(self) -> bool:
-        """Whether the layout was found by measuring the size of its parts."""
+        """Whether the total size of the parts is found by reading the parts."""
         return self.rule.within is None
 
     @property
@@ -186,7 +188,7 @@ class Region:
     def walk(
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
     ) -> FoundParts:
-        """Find the parts of the frames at these offsets.
+        """Find the parts of the frames at these offsets of a buffer.
 
         Args:
             stops: the end offset of each frame; by default the end of the buffer.
@@ -334,7 +336,7 @@ class _PartWalk:
         self._errors += [refused.error] if refused.error else []
 
     def _check_declared_sizes(self, layout: Layout, which: Offsets) -> Offsets:
-        """Return the frames whose next part declares the sizes that its layout has."""
+        """Return the frames in whose next part the size fields agree with the layout."""
         if not layout.held:
             return which
         matches = self._match_constants(which, merge_constants(sort_constants(layout.held)))

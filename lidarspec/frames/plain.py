@@ -1,7 +1,7 @@
 """Parse and build frames that have no layout, with construct, one at a time.
 
-A frame has no layout if the offset of a part cannot be computed. `lidarspec show` prints the part
-and the reason.
+A frame has no layout if the offset of a field cannot be computed. `lidarspec show` prints which
+field it is, and the reason.
 """
 
 from __future__ import annotations

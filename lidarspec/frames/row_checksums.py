@@ -83,7 +83,7 @@ def compute_over_spans(algorithm: Checksum, rows: NDArray[np.uint8], spans: Span
 
 
 def _are_few(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> bool:
-    """Return whether computing the checksums one by one is faster than together."""
+    """Return whether the rows are so few that computing one by one is faster."""
     if not isinstance(algorithm, Crc):
         return len(rows) < MIN_BATCH_ROWS
     length = _count_bytes(spans)
@@ -145,7 +145,14 @@ def _compute_word_xor(algorithm: WordXor, rows: NDArray[np.uint8], spans: Spans)
 def _group_word_masks(
     algorithm: WordXor, number: int
 ) -> list[tuple[list[int], tuple[np.uint64, np.uint64]]]:
-    """Return masks that select the low and the high bytes in each word of a row."""
+    """Group the words of a row by the masks that select their low and high bytes.
+
+    Args:
+        number: the number of words in a row.
+
+    Returns:
+        For each group, the indices of the words, and the two masks.
+    """
     masks = np.zeros((2, 8 * number), np.uint8)
     for mask, half in zip(masks, algorithm.halves, strict=True):
         for part in half:
@@ -429,8 +436,8 @@ def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
 
 @lru_cache(maxsize=256)
 def _assign_sums(number: int, poly: int) -> tuple[int, ...]:
-    """Return for each word a bit mask of the sums in `_sum_words` that contain it."""
-    # Bit n stands for the sum that `_sum_words` advances by n bytes.
+    """Return for each word a bit mask of the sums in `_sum_words` that it is added to."""
+    # Bit n stands for the one of the eight sums that `_sum_words` advances by n bytes.
     found = [1]
     while len(found) < number:
         share = found[-1]

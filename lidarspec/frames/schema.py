@@ -63,7 +63,8 @@ class PathMapping(dict[str, _Field]):
     The path of an element has an index: "columns[0].timestamp".
 
     Args:
-        element: a function that returns the value of an element; None if it does not exist.
+        element: a function that returns the value of an element, or None if there is no such
+            element.
     """
 
     def __init__(
@@ -142,9 +143,9 @@ class Schema:
 
     @cached_property
     def counting_fields(self) -> Mapping[str, str | None]:
-        """The field that contains the length of each array, by the path of the array.
+        """For each array, by path, the path of the field that contains its length.
 
-        The value is None if there is no such field.
+        The value is None if no field contains the length.
         """
         return {
             axis: None if count is None else find_count_field(count, self.fields)
@@ -167,12 +168,18 @@ class Schema:
 
     @cached_property
     def separate_parts(self) -> Mapping[str, PartSequence]:
-        """The sequences of parts that are not arrays, by path."""
+        """The sequences of parts that have tables of their own, by path.
+
+        The other sequences of parts are arrays of the frame, whose elements differ in size.
+        """
         return {axis: node for axis, node in self.parts.items() if not node.is_array}
 
     @cached_property
     def scan_names(self) -> Mapping[str, FieldInfo]:
-        """The fields of the frame and its parts, by the names that scans and clocks use."""
+        """The fields of the frame and its parts, by the names that scans and clocks use.
+
+        The name is the path; for a field in a part, it begins with the path of the kind of parts.
+        """
         names = dict(self.fields)
         for before, kind in self.part_kinds.items():
             names |= {
@@ -190,12 +197,14 @@ class Schema:
         }
 
     def split_part_path(self, path: str) -> tuple[str, str, str] | None:
-        """Split a path into a sequence of parts, a kind of part, and a field in the part.
+        """Split the path of a field in a part.
 
-        Returns None for all other paths.
+        Returns:
+            The path of the sequence of parts, the name of the kind of parts, and the path in the
+            part. None if the path is not in a sequence of parts with a table of its own.
 
         Raises:
-            UnknownField: if the path does not name one of several kinds of parts.
+            UnknownField: if the kinds of parts have names, and the path has none of them.
         """
         for axis, node in self.separate_parts.items():
             if path == axis or path.startswith(f"{axis}."):
@@ -237,7 +246,10 @@ class Schema:
         return found[0]
 
     def find_sequence(self, path: str) -> str | None:
-        """Return the path of the array of parts that contains a field; None if none does."""
+        """Return the path of the array of parts that contains a field, or None.
+
+        This is a sequence of parts that has no table of its own (see `separate_parts`).
+        """
         if not self.parts:
             return None
         base = without_indices(path)[0]
@@ -247,7 +259,7 @@ class Schema:
         return None
 
     def outer(self, axis: str) -> list[str]:
-        """Return the arrays that contain an array."""
+        """Return the paths of the arrays that contain an array."""
         return [other for other in self.arrays if axis.startswith((f"{other}.", f"{other}["))]
 
     def depth(self) -> int:

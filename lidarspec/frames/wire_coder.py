@@ -1,4 +1,4 @@
-"""Convert between encoded frames and the bytes of their structs.
+"""Convert between frames as they are sent and the bytes of their structs.
 
 Most frames are sent as the bytes of their struct (`Coder`). A frame type with a wire form
 (`lidarspec.spec.wire_forms`) has a `FormCoder`.
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.layout import Bytes2D, Layout, LayoutRefusal, Leaf
-from lidarspec.frames.layout_tree import HeaderNode, HeaderTree, find_prefix, frame_layouts
+from lidarspec.frames.layout_tree import HeaderNode, HeaderTree, find_fixed_constants, frame_layouts
 from lidarspec.frames.measured_size import MeasuredSize
 from lidarspec.spec.description import Frame
 from lidarspec.spec.wire_forms import (
@@ -39,7 +39,7 @@ MAX_SHOWN_BYTES = 12
 
 
 class _Undecoded(Decoded):
-    """The result for a frame that is sent as the bytes of its struct."""
+    """The result of `Coder.decode`: the bytes of the struct are those of the frame."""
 
     @property
     def offsets(self) -> list[int]:
@@ -57,7 +57,7 @@ class Coder:
     """
 
     def __init__(self, frame: Frame) -> None:
-        known = find_prefix(frame.tree, frame.max_struct_bytes)
+        known = find_fixed_constants(frame.tree, frame.max_struct_bytes)
         self.begins = _join_bytes(
             {offset: value for offset, (mask, value) in known.items() if mask == 0xFF}
         )
@@ -70,8 +70,9 @@ class Coder:
         """Return the frame for the bytes of a struct.
 
         Args:
-            spelling: the frame from which the values were parsed; it is returned if it decodes to
-                `struct`.
+            spelling: the frame from which the values were parsed, if it was kept. Several frames
+                may encode the same values, for example with the number 1 or 01. This frame is
+                returned if it decodes to `struct`.
 
         Returns:
             The encoded frame; None if the wire form cannot encode one of the values.
@@ -91,7 +92,11 @@ class Coder:
         return None
 
     def make_encodable(self, rows: Bytes2D, layout: Layout) -> None:
-        """Change random structs, given as rows of bytes, so that they can be encoded."""
+        """Change structs with random content so that the wire form can encode them.
+
+        Args:
+            rows: the bytes of the structs, one struct per row.
+        """
 
 
 class _FieldFinder:
@@ -129,7 +134,7 @@ class FormCoder(Coder):
     Attributes:
         form: the wire form.
         tree: the layouts of the struct.
-        prefix: the constant bytes before the first number, by offset.
+        prefix: the constant bytes of frames that precede the first number field, by offset.
 
     Raises:
         SpecError: if the fields of the struct do not have computable offsets.
@@ -158,7 +163,7 @@ class FormCoder(Coder):
                 break
             texts.append([known.get(place) for place in range(offset, offset + run.size)])
             offset += run.size
-        with _form_errors(self.form.begins):
+        with _translate_form_errors(self.form.begins):
             begins = tuple(self.form.begins(texts))
         return {offset: byte for offset, byte in enumerate(begins) if byte is not None}
 
@@ -174,7 +179,7 @@ class FormCoder(Coder):
 
     def decode_whole(self, data: bytes) -> Decoded:
         """Decode a frame that consists of exactly these bytes."""
-        with _form_errors(self.form.decode):
+        with _translate_form_errors(self.form.decode):
             decoded = self.form.decode(data, _FieldFinder(self.tree))
             if not isinstance(decoded, Decoded):
                 raise TypeError(f"returned {type(decoded).__name__}, expected Decoded")
@@ -182,10 +187,10 @@ class FormCoder(Coder):
 
     def find_end(self, data: bytes) -> int:
         """Return the size of the frame at the start of some bytes, as `WireForm.find_end` does."""
-        with _form_errors(self.form.find_end):
+        with _translate_form_errors(self.form.find_end):
             size = int(self.form.find_end(data))
             if size > len(data):
-                raise ValueError(f"returned {size} for {len(data)} bytes")
+                raise ValueError(f"returned the size {size}, but got only {len(data)} bytes")
         return size
 
     def find_size(self, data: bytes) -> int | None:
@@ -195,7 +200,10 @@ class FormCoder(Coder):
         return None
 
     def find_refusal(self, struct: bytes) -> LayoutRefusal | None:
-        """Return why a struct cannot have a layout; None if it may have one."""
+        """Return the reason why the bytes of a struct have no layout.
+
+        Returns None if they have a layout, or if the header is incomplete.
+        """
         result = self.tree.find_node(struct).result
         if isinstance(result, LayoutRefusal):
             return result
@@ -218,7 +226,7 @@ class FormCoder(Coder):
         layout = self.tree.find_node(struct, is_whole_frame=True).result
         if not isinstance(layout, Layout) or layout.size != len(struct):
             return None
-        with _form_errors(self.form.encode):
+        with _translate_form_errors(self.form.encode):
             return bytes(self.form.encode(struct, list_runs(layout)))
 
     def keep_spelling(self, values: Any, struct: bytes, data: bytes) -> Any:
@@ -232,7 +240,7 @@ class FormCoder(Coder):
             part = rows[:, begin : begin + int(run.sizes.sum())]
             begin += part.shape[1]
             if isinstance(run, NumberRun):
-                with _form_errors(self.form.largest):
+                with _translate_form_errors(self.form.largest):
                     sizes = run.sizes.tolist()
                     largest = np.array([self.form.largest(size) for size in sizes], np.uint64)
                 for row in part:
@@ -256,7 +264,7 @@ class FormCoder(Coder):
             reason = f"the frame ends at byte {size}, but {len(data) - size} more bytes follow"
             return Problem(size, reason, expected=size, got=len(data))
         if size <= 0:
-            reason = f"no end of frame in {len(data)} bytes"
+            reason = f"the frame does not end within {len(data)} bytes"
             return Problem(len(data), reason, got=len(data))
         if decoded.problem is not None and decoded.problem.reason:
             return decoded.problem
@@ -280,8 +288,12 @@ class FormCoder(Coder):
 
 
 @contextmanager
-def _form_errors(method: Callable[..., Any]) -> Iterator[None]:
-    """Convert exceptions of a method of a plugin's wire form to `PluginError`."""
+def _translate_form_errors(method: Callable[..., Any]) -> Iterator[None]:
+    """Convert exceptions in the block to `PluginError`.
+
+    Args:
+        method: the method of a plugin's wire form that the block calls.
+    """
     try:
         yield
     except SpecError:

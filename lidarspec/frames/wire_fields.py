@@ -27,7 +27,8 @@ class WireField:
 
     Attributes:
         path: the path with indices, such as "points[1].intensity".
-        block: the path of the bit block that contains the field; else the path of the field.
+        block: the path of the bit block that contains the field; if there is none, the path of the
+            field.
         info: the description of the field; its path is empty for a constant without a name.
         start: the offset of the first byte of the field, or of its bit block.
         end: the offset after the last byte of the field, or of its bit block.
@@ -106,7 +107,7 @@ class ExaminedFrame:
         failure: the error that prevented a layout; None if there is a layout.
         start: the offset of a part in the frame; 0 for a frame.
         prefix: the path of a part in the frame; "" for a frame.
-        is_bounded: for a part, whether the frame has bytes after its parts.
+        is_bounded: for a part, whether more bytes of the frame follow `data`.
     """
 
     root: tree.Node
@@ -372,7 +373,10 @@ class _Cursor:
         return WireField(shown, shown, info, start, start + size, None, raw)
 
     def _take(self, size: int) -> bytes | None:
-        """Return the next bytes and move to their end; None if they are not complete."""
+        """Return the next bytes, and move to their end.
+
+        If they are not complete, the method returns None, and does not move.
+        """
         end = self._offset + size
         if end > len(self._data):
             self._is_over = True

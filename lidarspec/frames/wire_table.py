@@ -100,10 +100,10 @@ def frame_size(frame: Frame) -> str:
 
 
 def extent(node: tree.Node, shown: str = "") -> SizeFormula:
-    """Return the size of a part.
+    """Return the size of a node of the tree in bytes, as a formula.
 
     Args:
-        shown: the path of the part. If only the bytes of the part determine its size, the result
+        shown: the path of the node. If the size is known only after the node was read, the result
             contains this path: "size(points[i].text)".
     """
     match node:
@@ -308,7 +308,7 @@ def describe_end(node: tree.PartSequence) -> str:
     )
     return (
         f"the first part has {format_formula(node.size)} bytes; {following} in each part is the"
-        " size of the next part (0: last part)"
+        " size of the next part, or 0 in the last part"
     )
 
 

@@ -1,9 +1,10 @@
 """Find and check the candidates in a piece of a stream.
 
-A candidate is an offset at which the constants of a frame type match. The active types may change
-with every frame (`after`). All candidates of one type in a piece are therefore checked together,
-when the type first becomes active. For a weak type (`confirm` > 1), only the first frame of each
-run is a candidate (`weak_frames`).
+A candidate is an offset at which the constants of a frame type match. A type that is declared with
+`after` is active only after a frame of another type, so the active types may change with every
+frame. So that a change does not require further checks, all candidates of one type in a piece are
+checked together, when the type first becomes active. For a weak type (`confirm` > 1), only the
+first frame of each run is a candidate (`weak_frames`).
 """
 
 from __future__ import annotations
@@ -63,9 +64,9 @@ class PieceResult:
 
     Attributes:
         frames: the accepted frames; their offsets count from the start of the piece.
-        end: the offset of the first byte that must be searched again.
+        end: the offset at which the next search must start. All bytes before it are decided.
         is_waiting: whether more bytes are required to decide about the candidate at `end`.
-        need: how many bytes, counted from `end`, the next search requires; 0 if unknown.
+        need: the number of bytes that the next search requires, counted from `end`; 0 if unknown.
         rejected: the number of rejected candidates, by the name of the counter.
         errors: the exceptions that plugin code has raised.
     """
@@ -121,16 +122,16 @@ class Framing:
         self._active: dict[str | None, list[int]] = {}
         self._filters: dict[tuple[int, ...], ConstantFilter] = {}
 
-    def active_types(self, mode: SearchState) -> list[int]:
+    def active_types(self, state: SearchState) -> list[int]:
         """Return the indices of the active types, in order."""
-        active = self._active.get(mode.after)
+        active = self._active.get(state.after)
         if active is None:
             active = [
                 kind
                 for kind, codec in enumerate(self.codecs)
-                if codec.frame.after in (None, mode.after)
+                if codec.frame.after in (None, state.after)
             ]
-            self._active[mode.after] = active
+            self._active[state.after] = active
         return active
 
     def filter(self, kinds: Sequence[int]) -> ConstantFilter:
@@ -144,16 +145,16 @@ class Framing:
         """Return whether frames of a type are accepted only in runs."""
         return kind in self._weak
 
-    def switches(self, kind: int, mode: SearchState) -> bool:
+    def switches(self, kind: int, state: SearchState) -> bool:
         """Return whether a frame of a type changes the active types."""
-        return self.names[kind] in self.named and self.names[kind] != mode.after
+        return self.names[kind] in self.named and self.names[kind] != state.after
 
-    def find_switching_types(self, mode: SearchState) -> NDArray[np.bool_]:
+    def find_switching_types(self, state: SearchState) -> NDArray[np.bool_]:
         """Return whether each frame type changes the active types, (types + 1,).
 
-        The last value is False.
+        The last value is False, for the kind -1 of data that is not a frame.
         """
-        return np.array([*(self.switches(kind, mode) for kind in range(len(self.names))), False])
+        return np.array([*(self.switches(kind, state) for kind in range(len(self.names))), False])
 
     def survey(
         self,
@@ -169,7 +170,7 @@ class Framing:
         Args:
             offsets: offsets at which the constants of the type match.
             stops: the end offset of each candidate; by default the end of the buffer.
-            gathered: whether to copy the bytes of candidates to `Frames.rows`.
+            gathered: whether the bytes of the candidates are copied to `Frames.rows`.
 
         Returns:
             The candidates, each with its layout and its status.
@@ -223,7 +224,7 @@ class ConstantFilter:
                 table = self._tables.setdefault(offset, np.full(256, self._all_types))
                 table[np.arange(256) & mask != value] &= ~np.uint64(1 << number)
 
-    def sort(self, buffer: Bytes1D, offsets: Offsets) -> dict[int, Offsets]:
+    def group_by_type(self, buffer: Bytes1D, offsets: Offsets) -> dict[int, Offsets]:
         """Return the offsets at which the constants of each type match, by type index.
 
         Constants beyond the end of the buffer count as matching. Types without matches are left
@@ -252,7 +253,7 @@ class ConstantFilter:
 
 @dataclass(frozen=True, eq=False)
 class LiveCandidates:
-    """The candidates of a piece that may be accepted under the same active types.
+    """The candidates of a piece that may be accepted with one set of active types.
 
     Attributes:
         frames: the valid and incomplete candidates, sorted by offset, at most one at each offset.
@@ -270,28 +271,29 @@ class Candidates:
     """The candidates in a piece of a stream.
 
     Args:
-        mode: the search state at the start of the buffer.
+        state: the search state at the start of the buffer.
         final: whether no more bytes follow, so that incomplete candidates are rejected.
 
     Attributes:
-        buffer: the bytes to search, shortened if there are too many candidates.
-        is_whole: whether `buffer` was not shortened.
+        buffer: the bytes to search. If the piece has too many candidates, these are only the first
+            bytes of the piece; the other bytes are searched in the next piece.
+        is_whole: whether `buffer` is the whole piece.
         checked: the checked candidates of each type that was searched so far, by type index.
     """
 
     def __init__(
-        self, framing: Framing, buffer: Bytes1D, mode: SearchState, *, final: bool
+        self, framing: Framing, buffer: Bytes1D, state: SearchState, *, final: bool
     ) -> None:
         self._framing = framing
         self.buffer = buffer
-        if not all(framing.marks[kind] for kind in framing.active_types(mode)):
+        if not all(framing.marks[kind] for kind in framing.active_types(state)):
             self.buffer = buffer[: max(MAX_CANDIDATES, framing.reach)]  # each offset is one
         self._offsets_by_prefix: dict[Marks, Offsets] = {}
         self.checked: dict[int, Frames] = {}
         self._live: dict[int, Frames] = {}
         self._waiting: dict[int, list[int]] = {}
         self._known: set[int] = set()
-        offsets_by_kind = self._find_by_type(mode)
+        offsets_by_kind = self._find_by_type(state)
         limit = min(
             (
                 int(offsets[MAX_CANDIDATES])
@@ -311,15 +313,18 @@ class Candidates:
         self.final = final and self.is_whole
         self._check(offsets_by_kind)
 
-    def find_live(self, mode: SearchState) -> LiveCandidates | None:
-        """Return the candidates that may be accepted; None if there are too many of them."""
-        offsets_by_kind = self._find_by_type(mode)
+    def find_live(self, state: SearchState) -> LiveCandidates | None:
+        """Return the candidates of the active types that may be accepted.
+
+        Returns None if there are too many candidates.
+        """
+        offsets_by_kind = self._find_by_type(state)
         if any(len(offsets) > MAX_CANDIDATES for offsets in offsets_by_kind.values()):
             return None
         self._check(offsets_by_kind)
         parts = list[Frames]()
         all_runs = dict[int, WeakRuns]()
-        active = self._framing.active_types(mode)
+        active = self._framing.active_types(state)
         for kind in active:
             own = self.checked.get(kind)
             if own is None:
@@ -329,7 +334,7 @@ class Candidates:
                     own,
                     self._merge([*parts, *self._find_waiting(active[: active.index(kind)])]),
                     confirm=self._framing.codecs[kind].frame.confirm,
-                    is_single=self._framing.switches(kind, mode),
+                    is_single=self._framing.switches(kind, state),
                     final=self.final,
                 )
                 all_runs[kind] = runs
@@ -370,10 +375,10 @@ class Candidates:
             )
         ]
 
-    def _find_by_type(self, mode: SearchState) -> dict[int, Offsets]:
+    def _find_by_type(self, state: SearchState) -> dict[int, Offsets]:
         """Return the offsets of candidates of newly active types, by type index."""
         groups: dict[Marks, list[int]] = {}
-        for kind in self._framing.active_types(mode):
+        for kind in self._framing.active_types(state):
             if kind not in self._known:
                 groups.setdefault(self._framing.marks[kind][:SHARED_MARKS], []).append(kind)
         offsets_by_kind: dict[int, Offsets] = {}
@@ -386,7 +391,7 @@ class Candidates:
                 continue
             for first in range(0, len(kinds), MAX_TYPES):
                 some = kinds[first : first + MAX_TYPES]
-                matching = self._framing.filter(some).sort(self.buffer, offsets)
+                matching = self._framing.filter(some).group_by_type(self.buffer, offsets)
                 offsets_by_kind |= {
                     kind: matching.get(index, offsets[:0]) for index, kind in enumerate(some)
                 }
@@ -395,7 +400,7 @@ class Candidates:
     def _check(self, offsets_by_kind: Mapping[int, Offsets]) -> None:
         self._known |= offsets_by_kind.keys()
         for kind, offsets in offsets_by_kind.items():
-            number = self._count_arrived(kind, offsets)
+            number = self._count_checkable(kind, offsets)
             self._waiting[kind] = offsets[number:].tolist()
             if not number:
                 continue
@@ -405,8 +410,8 @@ class Candidates:
                 own = own if is_right.all() else own.select(is_right)
             self.checked[kind] = own
 
-    def _count_arrived(self, kind: int, offsets: Offsets) -> int:
-        """Return how many candidates can be checked now."""
+    def _count_checkable(self, kind: int, offsets: Offsets) -> int:
+        """Return how many candidates have arrived up to the last constant of their type."""
         if not len(offsets) or self.final or self._framing.is_weak(kind):
             return len(offsets)
         last = len(self.buffer) - self._framing.ends[kind]

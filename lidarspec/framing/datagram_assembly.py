@@ -1,8 +1,9 @@
 """Join messages that arrive in several datagrams, before they are framed.
 
 Fragments of a message may arrive in any order. A message is returned when all its fragments have
-arrived. An incomplete message is dropped when a few newer messages have begun, when a second has
-passed, or when no data arrives. Datagrams that are not fragments are returned unchanged.
+arrived. An incomplete message is dropped if there are too many newer incomplete messages, if more
+than `MAX_WAIT_NS` have passed since its first fragment, or if no data arrives. Datagrams that are
+not fragments are returned unchanged.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ class JoinedMessages:
         at: the arrival time of each message, ns.
         places: the offset of each message in the input.
         dropped: the number of bytes that were dropped before each message, and after the last one.
-        heads: the number of bytes in the fragments that are not payload.
+        heads: the number of bytes outside the payloads, such as headers, in all fragments.
     """
 
     buffer: NDArray[np.uint8]

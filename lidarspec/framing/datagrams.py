@@ -32,22 +32,22 @@ from lidarspec.framing.results import (
 
 
 def sort_datagrams(
-    framing: Framing, buffer: Bytes1D, starts: Numbers, sizes: Indices, mode: SearchState
+    framing: Framing, buffer: Bytes1D, starts: Numbers, sizes: Indices, state: SearchState
 ) -> PieceResult:
     """Find the type of each datagram.
 
     Args:
         starts: the offset of each datagram in the buffer, in the order of arrival.
         sizes: the size of each datagram in bytes.
-        mode: the state between batches, which is updated.
+        state: the state between batches, which is updated.
 
     Returns:
         All datagrams as frames; datagrams that are not frames have the kind -1.
     """
-    regular_frames = find_regular_datagrams(framing, buffer, starts, sizes, mode)
+    regular_frames = find_regular_datagrams(framing, buffer, starts, sizes, state)
     if regular_frames is not None and regular_frames.is_all_valid:
         return PieceResult(regular_frames, len(buffer))
-    return _DatagramBatch(framing, buffer, to_array(starts), sizes, regular_frames).sort(mode)
+    return _DatagramBatch(framing, buffer, to_array(starts), sizes, regular_frames).sort(state)
 
 
 class _DatagramBatch:
@@ -73,32 +73,32 @@ class _DatagramBatch:
         self._known: dict[str | None, tuple[int, Frames, Status, list[int]]] = {}
         self._piece = PieceResult(Frames.make_empty(buffer), len(buffer))
 
-    def sort(self, mode: SearchState) -> PieceResult:
+    def sort(self, state: SearchState) -> PieceResult:
         """Find the type of each datagram."""
         position = 0
         parts = list[Frames]()
         while position < len(self._starts):
-            part = self._sort_from(position, mode)
+            part = self._sort_from(position, state)
             parts.append(part)
             position += len(part)
         if parts:
             self._piece.frames = Frames.join(parts)
         return self._piece
 
-    def _sort_from(self, position: int, mode: SearchState) -> Frames:
+    def _sort_from(self, position: int, state: SearchState) -> Frames:
         """Find the types of the datagrams, beginning with index `position`.
 
         The result ends with the first frame that changes the active types.
         """
-        if mode.after not in self._known:
-            frames, reasons = self._check(self._starts[position:], self._sizes[position:], mode)
+        if state.after not in self._known:
+            frames, reasons = self._check(self._starts[position:], self._sizes[position:], state)
             if self._framing.named:
-                is_switch = self._framing.find_switching_types(mode)[frames.kinds]
+                is_switch = self._framing.find_switching_types(state)[frames.kinds]
                 rows = (np.flatnonzero(is_switch) + position).tolist()
             else:
                 rows = []
-            self._known[mode.after] = position, frames, reasons, rows
-        first, frames, reasons, rows = self._known[mode.after]
+            self._known[state.after] = position, frames, reasons, rows
+        first, frames, reasons, rows = self._known[state.after]
         index = bisect.bisect_left(rows, position)
         if index < len(rows):
             stop = rows[index] + 1
@@ -107,16 +107,16 @@ class _DatagramBatch:
         frames = frames.select(slice(position - first, stop - first))
         lost = np.flatnonzero(frames.kinds < 0)
         if len(lost):
-            frames = self._count_rejected(frames, lost, reasons[position - first :][lost], mode)
+            frames = self._count_rejected(frames, lost, reasons[position - first :][lost], state)
         if (
             len(frames)
             and frames.kinds[-1] >= 0
-            and self._framing.switches(int(frames.kinds[-1]), mode)
+            and self._framing.switches(int(frames.kinds[-1]), state)
         ):
-            mode.after = self._framing.names[int(frames.kinds[-1])]
+            state.after = self._framing.names[int(frames.kinds[-1])]
         return frames
 
-    def _check(self, starts: Indices, sizes: Indices, mode: SearchState) -> tuple[Frames, Status]:
+    def _check(self, starts: Indices, sizes: Indices, state: SearchState) -> tuple[Frames, Status]:
         """Find the type and the layout of each datagram."""
         number = len(starts)
         common_size = broadcast_value(sizes)
@@ -135,7 +135,7 @@ class _DatagramBatch:
         left = np.arange(number)
         layouts: tuple[Layout, ...] = ()
         fixed = [
-            (kind, self._framing.codecs[kind].size) for kind in self._framing.active_types(mode)
+            (kind, self._framing.codecs[kind].size) for kind in self._framing.active_types(state)
         ]
         # No datagram fits them, so they can only give a reason.
         others = [kind for kind, size in fixed if size is not None and not least <= size <= most]
@@ -186,9 +186,16 @@ class _DatagramBatch:
         return self._framing.survey(kind, self._buffer, starts, starts + sizes, gathered=False)
 
     def _count_rejected(
-        self, frames: Frames, lost: Indices, reasons: Status, mode: SearchState
+        self, frames: Frames, lost: Indices, reasons: Status, state: SearchState
     ) -> Frames:
-        """Count invalid datagrams by reason.
+        """Count invalid datagrams.
+
+        A datagram for which the plugin failed may have failed because of other datagrams. It is
+        checked again alone first, and may be valid.
+
+        Args:
+            lost: the indices of the invalid datagrams.
+            reasons: the status of each invalid datagram.
 
         Returns:
             The datagrams up to the first frame that changes the active types.
@@ -196,27 +203,27 @@ class _DatagramBatch:
         parts = list[Frames]()
         begun = 0
         for index in lost[reasons == PLUGIN].tolist():
-            alone = self._check_alone(frames.select(slice(index, index + 1)), mode)
+            alone = self._check_alone(frames.select(slice(index, index + 1)), state)
             if alone is None:
                 continue
             parts += [frames.select(slice(begun, index)), alone]
             begun = index + 1
-            if self._framing.switches(alone.kinds.item(0), mode):
+            if self._framing.switches(alone.kinds.item(0), state):
                 frames = frames.select(slice(0, begun))
                 break
         counted = (reasons != PLUGIN) & (lost < len(frames))
-        self._count_by_reason(reasons[counted], frames.sizes[lost[counted]], mode)
+        self._count_by_reason(reasons[counted], frames.sizes[lost[counted]], state)
         if parts:
             return Frames.join([*parts, frames.select(slice(begun, None))])
         return frames
 
-    def _check_alone(self, datagram: Frames, mode: SearchState) -> Frames | None:
+    def _check_alone(self, datagram: Frames, state: SearchState) -> Frames | None:
         """Check one datagram, and return it as a frame; None if it is invalid."""
         rejected = 0
         start = datagram.starts
         size = datagram.sizes
         data = self._buffer[start.item(0) : start.item(0) + size.item(0)]
-        for kind in self._framing.active_types(mode) if len(data) else ():
+        for kind in self._framing.active_types(state) if len(data) else ():
             if not self._has_constants(kind, start, size).all():
                 continue
             is_rest = self._framing.codecs[kind].frame.endless is not None
@@ -228,14 +235,14 @@ class _DatagramBatch:
                 )
             rejected = max(rejected, int(frame.status[0]) or LENGTH)
             self._piece.errors += frame.errors
-        self._count_by_reason(np.array([rejected], np.uint8), size, mode)
+        self._count_by_reason(np.array([rejected], np.uint8), size, state)
         return None
 
     def _count_by_reason(
-        self, reasons: NDArray[np.uint8], sizes: Indices, mode: SearchState
+        self, reasons: NDArray[np.uint8], sizes: Indices, state: SearchState
     ) -> None:
-        """Count rejected datagrams by reason."""
-        least = min(self._framing.ends[kind] for kind in self._framing.active_types(mode))
+        """Add rejected datagrams to the counters of the reasons."""
+        least = min(self._framing.ends[kind] for kind in self._framing.active_types(state))
         unknown = np.isin(reasons, (VALID, CONSTANT))
         others = unknown & (sizes >= max(least, 1))
         if number := int(np.count_nonzero(others)):

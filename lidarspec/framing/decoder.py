@@ -2,7 +2,8 @@
 
 On a byte stream, bytes at the end of the input may be an incomplete frame. They are searched again
 with the next input. On a datagram link, each datagram is one frame. The frames and counters do not
-depend on the division of the input.
+depend on the division of the input. Fillers are bytes that a sensor sends between frames
+(`Sensor.fillers`).
 """
 
 from __future__ import annotations
@@ -58,7 +59,8 @@ class DecoderObserver(Protocol):
     ) -> None:
         """Receive a piece of a stream, or datagrams, that a decoder is about to decode.
 
-        `decoder.stats` does not count the input yet. The buffer is not changed later.
+        `decoder.stats` does not count the input yet. The decoder does not change the buffer later,
+        so the observer may keep it.
         """
 
     def observe_frames(self, frames: Frames) -> None:
@@ -89,7 +91,7 @@ class Decoder:
     ) -> None:
         if not sensor.incoming:
             raise UsageError(
-                f"{sensor.id} has no frames yet: configure the sensor with its file first"
+                f"{sensor.id} has no frames without its configuration file: see sensor.configure"
             )
         self.sensor = sensor
         self.stream = stream
@@ -100,7 +102,7 @@ class Decoder:
         self.framing = _make_framing(tuple(sensor.incoming), tuple(sensor.incoming.values()), sums)
         # Frames are read as if the frame that the answer comes after had been seen.
         answer = sensor.options.get("answer", "")
-        self._mode = SearchState(
+        self._state = SearchState(
             after=sensor.frames[answer].after if answer in sensor.frames else None
         )
         self._pending = b""
@@ -143,7 +145,7 @@ class Decoder:
         return [found for frames in self.frames(data, at) for found in frames.to_found()]
 
     def idle(self) -> list[Found]:
-        """Reject incomplete candidates, because no data has arrived for a while.
+        """Reject incomplete candidates; call this when no data has arrived for a while.
 
         Returns:
             The frames that are found when the bytes of these candidates are searched again.
@@ -151,7 +153,7 @@ class Decoder:
         return [found for frames in self.take_pending() for found in frames.to_found()]
 
     def finish(self) -> list[Found]:
-        """Reject incomplete candidates, because the input has ended.
+        """Reject incomplete candidates; call this when the input has ended.
 
         Returns:
             The frames that are found when the bytes of these candidates are searched again.
@@ -267,7 +269,7 @@ class Decoder:
             self.stats.bytes_skipped += joined.heads
             self.stats.bytes_filler += joined.heads
             self.stats.pending = self._assembly.pending
-        piece = sort_datagrams(self.framing, buffer, starts, sizes, self._mode)
+        piece = sort_datagrams(self.framing, buffer, starts, sizes, self._state)
         frames = piece.frames
         self._base = self._base + total
         self.stats.bytes_in = self.stats.bytes_in + total
@@ -301,7 +303,7 @@ class Decoder:
         good: NDArray[np.bool_],
         joined: JoinedMessages | None,
     ) -> NDArray[np.int64]:
-        """Count the skipped bytes in a batch of datagrams.
+        """Add the skipped bytes in a batch of datagrams to the counters.
 
         Returns:
             The number of skipped bytes before each frame, without fillers.
@@ -317,7 +319,7 @@ class Decoder:
         return np.diff(before)
 
     def _count_dropped(self, size: int) -> None:
-        """Count skipped bytes, and add them to the gap before the next frame."""
+        """Add skipped bytes to the counter, and to the gap before the next frame."""
         self._gap = self._gap + size
         self.stats.bytes_skipped = self.stats.bytes_skipped + size
 
@@ -362,9 +364,9 @@ class Decoder:
         """Find the frames in a piece of a stream."""
         piece = None
         if not final:
-            piece = find_regular_frames(self.framing, buffer, self._mode, self._base)
+            piece = find_regular_frames(self.framing, buffer, self._state, self._base)
         if piece is None:
-            piece = find_frames(self.framing, buffer, self._mode, self._base, final=final)
+            piece = find_frames(self.framing, buffer, self._state, self._base, final=final)
         return piece
 
     def _count_piece(self, buffer: NDArray[np.uint8], piece: PieceResult, at: int | None) -> Frames:
@@ -386,7 +388,7 @@ class Decoder:
         )
 
     def _count_gaps(self, buffer: NDArray[np.uint8], frames: Frames, end: int) -> NDArray[np.int64]:
-        """Count the skipped bytes in a piece.
+        """Add the skipped bytes in a piece to the counters.
 
         Args:
             end: the offset of the end of the piece.
@@ -409,7 +411,7 @@ class Decoder:
     def _count_skipped(
         self, buffer: NDArray[np.uint8], sizes: NDArray[np.int64], stops: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Count the bytes of skipped ranges, (n,), without fillers."""
+        """Add skipped ranges to the counters; return their sizes without fillers, (n,)."""
         self.stats.bytes_skipped += int(sizes.sum())
         for index in np.flatnonzero(sizes).tolist() if self._fillers else ():
             skipped = buffer[stops[index] - sizes[index] : stops[index]]

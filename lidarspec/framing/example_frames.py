@@ -1,7 +1,8 @@
 """Make valid frames with seeded random content, for tests, docs and the REPL.
 
 A random header determines a layout, and the rest of the frame is filled with random bytes. Frames
-that are not plausible are drawn again.
+that are not plausible are replaced by other random frames. If none is plausible, the values of some
+fields, such as counters and times, come from the `sweep` that the plugin declares for simulations.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from lidarspec.errors import (
 from lidarspec.frames.build import build
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows
 from lidarspec.frames.layout import Layout, Leaf
-from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, find_layout
+from lidarspec.frames.layout_tree import InvalidLengthError, UnknownSelectorError, find_layout
 from lidarspec.frames.measured_size import MeasuredSize
 from lidarspec.frames.schema import make_schema
 from lidarspec.frames.wire_coder import frame_coder
@@ -79,7 +80,12 @@ def example(sensor: SensorDescription, frame: str, *, seed: int = 0) -> bytes:
 def random_frame(
     sensor: SensorDescription, frame: str, source: random.Random, drawn: Drawn = NOTHING
 ) -> bytes:
-    """Return a valid frame with a random header and random content."""
+    """Return a valid frame with a random header and random content.
+
+    Args:
+        source: the generator of random numbers.
+        drawn: functions that draw the raw values of certain fields, by path.
+    """
     engine = get_codec(sensor.frames[frame])
     if not engine.is_compiled or engine.schema.has_measured_sizes:
         return draw_frame(sensor, frame, source, drawn)
@@ -96,14 +102,15 @@ def draw_row(
     drawn: Drawn = NOTHING,
     tries: int = MAX_TRIES,
 ) -> tuple[Layout, NDArray[np.uint8]]:
-    """Draw a random header; return its layout and a valid struct, (size,).
+    """Make a valid random frame; return its layout and its struct bytes, (size,).
 
     Args:
         frame: the name of a frame type with layouts and without parts.
+        source, drawn: see `random_frame`.
         tries: the maximum number of attempts.
 
     Raises:
-        SpecError: if none of the frames is plausible.
+        SpecError: if no attempt results in a plausible frame.
     """
     engine = get_codec(sensor.frames[frame])
     random_tries = tries
@@ -134,7 +141,9 @@ def make_random_header(
     """
     keys = sorted(iter_switch_keys(engine.frame.tree))
     for _ in range(MAX_HEADERS):
-        with contextlib.suppress(TooLongError, ArithmeticError, LookupError, TypeError, ValueError):
+        with contextlib.suppress(
+            InvalidLengthError, ArithmeticError, LookupError, TypeError, ValueError
+        ):
             return _draw_header(engine.frame, source, drawn, keys)
     raise SpecError("no example found: no random header leads to a frame within max_length")
 
@@ -321,7 +330,7 @@ def valid_mask(
 def _find_encodable(
     sensor: SensorDescription, frame: str, rows: NDArray[np.uint8]
 ) -> NDArray[np.uint8] | None:
-    """Return the first struct that the wire form can encode; None if it can encode none."""
+    """Return the first row of struct bytes that the wire form can encode, or None."""
     encode = frame_coder(sensor.frames[frame]).encode
     return next((row for row in rows if encode(row.tobytes()) is not None), None)
 
@@ -334,7 +343,7 @@ def _draw_from_sweep(
     drawn: Drawn,
     tries: int,
 ) -> tuple[Layout, NDArray[np.uint8]]:
-    """Return a layout and a struct with the values of the sensor's `sweep`."""
+    """Return a layout and a row of struct bytes with values of the sensor's `sweep`."""
     sweep = sensor.simulation_of(frame).sweep
     if sweep is None:
         raise SpecError(
@@ -368,7 +377,7 @@ def _draw_from_sweep(
 
 
 def _store_swept(leaf: Leaf, rows: NDArray[np.uint8], value: Any) -> None:
-    """Write a value of a sweep into a struct, if value and field have the same length."""
+    """Write a value of a sweep into a field, if value and field have the same length."""
     raw = leaf.raw([value])[(slice(None), *map(slice, leaf.shape))]
     if all(length in (1, room) for length, room in zip(raw.shape[1:], leaf.shape, strict=False)):
         leaf.store(rows, raw)
@@ -381,7 +390,7 @@ def _store_drawn(
     drawn: Drawn,
     source: random.Random,
 ) -> None:
-    """Write drawn values into structs, except for fields that determine the layout."""
+    """Write drawn values into all fields that do not determine the layout."""
     for path, draw in drawn.items():
         if path in layout.leaves and path not in chosen:
             leaf = layout.leaves[path]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError
 from lidarspec.frames.frame_table import Table
 from lidarspec.frames.layout import Layout, Sums, sort_constants
-from lidarspec.frames.layout_tree import find_prefix
+from lidarspec.frames.layout_tree import find_fixed_constants
 from lidarspec.frames.schema import make_schema
 from lidarspec.framing.plausibility import CandidateChecker, StructConditions
 from lidarspec.framing.results import Frames, Status
@@ -23,7 +23,7 @@ class Codec:
 
     Attributes:
         prefix: the constants that all frames begin with, as (mask, value) by offset.
-        marks: the same constants as a list, whole bytes first.
+        marks: the constants in `prefix` as a list, first the bytes in which all bits are constant.
         size: the size of all frames of the type in bytes; None if sizes differ.
         layout: the layout of all frames; None if layouts differ or construct parses the frames.
         is_compiled: whether the frames have layouts.
@@ -35,7 +35,7 @@ class Codec:
     def __init__(self, frame: Frame) -> None:
         self.frame = frame
         self.schema = make_schema(frame.tree)
-        self.prefix = find_prefix(frame.tree, frame.max_struct_bytes)
+        self.prefix = find_fixed_constants(frame.tree, frame.max_struct_bytes)
         self.marks = sort_constants(self.prefix)
         self.size = fixed_size(frame.prepared) or None
         self._conditions: StructConditions | None = None
@@ -55,7 +55,7 @@ class Codec:
         Args:
             offsets: the offsets, at which the prefix has to match.
             stops: the end offset of each candidate; None if more bytes may follow.
-            gathered: whether to copy the bytes of candidates to `Frames.rows`.
+            gathered: whether the bytes of the candidates are copied to `Frames.rows`.
         """
         raise NotImplementedError
 
@@ -73,20 +73,20 @@ class Codec:
         return None
 
     def table(self, frames: Iterable[bytes]) -> Table:
-        """Return valid frames of this type as columns."""
+        """Return the columns of valid frames of this type, given the bytes of each frame."""
         raise NotImplementedError
 
     def table_of_structs(self, structs: Iterable[bytes]) -> Table:
-        """Return valid frames of this type as columns, given the bytes of their structs."""
+        """Return the columns of valid frames, given the bytes of the struct of each frame."""
         return self.table(structs)
 
     def gather(self, frames: Frames) -> Table:
-        """Return accepted frames of this type as columns."""
+        """Return the columns of accepted frames of this type, given as `Frames`."""
         return self.table(map(frames.data, range(len(frames))))
 
     @property
     def _checked_constants(self) -> Mapping[int, tuple[int, int]]:
-        """The constants that candidates were already checked for."""
+        """The constants that the search has compared before it calls `survey`."""
         return self.prefix
 
     def make_checker(self, layout: Layout) -> CandidateChecker:

@@ -42,7 +42,7 @@ class CompiledCodec(Codec):
     """The codec of a frame type with layouts.
 
     Raises:
-        NotCompilableError: if the offset of a part of the struct cannot be computed.
+        NotCompilableError: if the offset of a field of the struct cannot be computed.
     """
 
     def __init__(self, frame: Frame) -> None:
@@ -144,7 +144,7 @@ class CompiledCodec(Codec):
         offsets: NDArray[np.intp],
         stops: NDArray[np.intp] | None,
     ) -> list[Group]:
-        """Refuse datagrams that are longer than the largest frame of the type."""
+        """Move datagrams that are too long for the type to a group without a layout."""
         # The frames of this type extend to the end of the datagram. They do not exist in a stream,
         # in which `stops` is None.
         is_fitting = np.zeros(len(offsets), np.bool_)
@@ -185,7 +185,7 @@ class CompiledCodec(Codec):
         )
         whole = which[is_whole]
         status[whole] = together.check(buffer, offsets[whole], together.forms[is_whole], sums)
-        if together.is_final:
+        if together.is_complete:
             return []
         is_undecided = np.zeros(len(which), np.bool_)
         is_undecided[is_whole] = status[whole] == VALID
@@ -214,8 +214,10 @@ class CompiledCodec(Codec):
         """Check the candidates of one layout.
 
         Returns:
-            The status of each candidate; the size of each candidate in bytes, or the number of
-            bytes needed to decide about it; the bytes of complete candidates, (n, size), or None.
+            The status of each candidate, (n,).
+            The size of each complete candidate in bytes, and for an incomplete candidate the number
+            of bytes that are needed to decide about it, (n,).
+            The bytes of the complete candidates, (k, size), if they were gathered; else None.
         """
         whole = offsets <= (len(buffer) if stops is None else stops) - layout.size
         count = int(np.count_nonzero(whole))
@@ -252,7 +254,7 @@ class CompiledCodec(Codec):
         return self.gather(Frames(joined, repeat(0, len(frames)), np.cumsum(sizes) - sizes, sizes))
 
     def gather(self, frames: Frames) -> CompiledTable:
-        """Return frames of this type as columns."""
+        """Return the columns of frames of this type, given as `Frames`."""
         if frames.rows is not None and frames.layout is not None:
             if 2 * frames.rows.size >= len(frames.buffer):
                 rows = frames.rows

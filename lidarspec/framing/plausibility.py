@@ -2,9 +2,9 @@
 
 Each check is applied to the candidates that have passed the previous checks.
 
-The `plausible` function of a frame type is traced once. A condition on one or two adjacent bytes
-becomes a lookup table. A function that cannot be traced is called with the columns of the
-candidates.
+The `plausible` function of a frame type is traced once, and split into conditions at its "and"
+operators. A condition on one or two adjacent bytes becomes a lookup table. A function that cannot
+be traced is called with the columns of the candidates.
 """
 
 from __future__ import annotations
@@ -58,6 +58,8 @@ MAX_COMPARED_VALUES = 2
 #: `CONSTANT`, `FAILED`.
 STATUS_BY_PARTS = np.array([VALID, LENGTH, LENGTH, CONSTANT, PLUGIN], np.uint8)
 
+#: A condition for the frames of one layout: a function that returns whether each frame, given as a
+#: row of bytes, meets the condition.
 Check = Callable[[Bytes2D], NDArray[np.bool_]]
 
 
@@ -65,13 +67,15 @@ class CandidateChecker:
     """Checks candidates of one layout.
 
     Args:
-        prefix: the constants that the candidates were already checked for.
+        prefix: the constants that the search has already compared, as (mask, value) by offset.
         struct_checks: the conditions of the struct on the values of its fields.
         plausibility_checks: the conditions of the plausibility function; None if the function has
             to be called.
 
     Attributes:
-        is_complete: whether the plausibility function need not be called.
+        checks: all conditions that can be checked without calling the plausibility function.
+        is_complete: whether `checks` contains all conditions of the plausibility function, so that
+            the function need not be called.
     """
 
     def __init__(
@@ -217,7 +221,8 @@ def check_plausibility(frame: Frame, table: Table, errors: list[PluginError]) ->
     The status is `VALID`, `IMPLAUSIBLE`, or `PLUGIN` if the function failed.
 
     Args:
-        table: frames of one layout, so that no array is padded.
+        table: the frames. They must have one layout, because arrays of different lengths would be
+            padded, and the function would see the padding.
     """
     assert frame.plausible is not None
     batch = Batch(table, np.zeros(len(table), np.bool_))
@@ -250,7 +255,7 @@ class StructConditions:
         self._tables: dict[tuple[Any, ...], _LookupTable] = {}
 
     def make_struct_conditions(self, layout: Layout) -> list[Check]:
-        """Return the conditions of the struct as checks for the frames of a layout."""
+        """Return the checks for the conditions of the struct, for frames of one layout."""
         every = (
             (
                 condition,
@@ -265,9 +270,9 @@ class StructConditions:
         return [self._check(condition, leaves) for condition, leaves in every]
 
     def make_checks(self, layout: Layout) -> list[Check] | None:
-        """Return the checks that frames of a layout have to pass.
+        """Return the checks that replace the plausibility function, for one layout.
 
-        Returns None if the plausibility function has to be called.
+        Returns None if the function has to be called.
         """
         if self._conditions is None:
             return None
@@ -448,7 +453,8 @@ def _find_bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
     """Return the bits on which a condition depends, and the values that make it true.
 
     Returns:
-        A mask of the bits, and one or two values of the masked bits; else None.
+        A mask of the bits, and the values of the masked bits that make the condition true. None if
+        there are no such values, or more than `MAX_COMPARED_VALUES`.
     """
     values = np.arange(len(listed))
     mask = sum(

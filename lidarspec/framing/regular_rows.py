@@ -23,29 +23,29 @@ DISTINCTIVE_CONSTANTS = 4
 
 
 def find_regular_frames(
-    framing: Framing, buffer: NDArray[np.uint8], mode: SearchState, base: int
+    framing: Framing, buffer: NDArray[np.uint8], state: SearchState, base: int
 ) -> PieceResult | None:
     """Return the frames at the start of a piece; None if the piece must be searched.
 
     Args:
         buffer: the undecided bytes of the last search, and the new bytes.
-        mode: the state between pieces, which is updated.
+        state: the state between pieces, which is updated.
         base: the offset of the buffer in the stream.
     """
-    if not mode.size or not (mode.is_steady or len(buffer) <= SMALL_PIECE_BYTES):
+    if not state.size or not (state.is_steady or len(buffer) <= SMALL_PIECE_BYTES):
         return None
-    number = len(buffer) // mode.size
+    number = len(buffer) // state.size
     if not number:
         return None
-    rows = buffer[: number * mode.size].reshape(number, mode.size)
-    for kind in framing.active_types(mode):
+    rows = buffer[: number * state.size].reshape(number, state.size)
+    for kind in framing.active_types(state):
         lead = count_leading_matches(framing, kind, rows)
         if lead is None:
             continue
         is_weak = framing.is_weak(kind)
-        if is_weak and (mode.run, mode.run_end) != (framing.names[kind], base):
+        if is_weak and (state.run, state.run_end) != (framing.names[kind], base):
             return None
-        if 2 * lead <= number or framing.switches(kind, mode):
+        if 2 * lead <= number or framing.switches(kind, state):
             return None
         frames = check_rows(framing, kind, buffer, rows[:lead], 0)
         if frames is None:
@@ -54,17 +54,17 @@ def find_regular_frames(
             valid = lead
         else:
             valid = int((frames.status != 0).argmax())
-        mode.is_steady = 2 * valid > number
-        if not mode.is_steady:
+        state.is_steady = 2 * valid > number
+        if not state.is_steady:
             return None
         if is_weak:
-            mode.run_end = base + valid * mode.size
-        return _make_result(framing, mode, frames.select(slice(0, valid)))
+            state.run_end = base + valid * state.size
+        return _make_result(framing, state, frames.select(slice(0, valid)))
     return None
 
 
 def find_regular_datagrams(
-    framing: Framing, buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices, mode: SearchState
+    framing: Framing, buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices, state: SearchState
 ) -> Frames | None:
     """Check datagrams at equal distances as frames of one type and layout.
 
@@ -73,10 +73,10 @@ def find_regular_datagrams(
     rows = _view_rows(buffer, starts, sizes)
     if rows is None:
         return None
-    kind = _guess_type(framing, rows, mode)
+    kind = _guess_type(framing, rows, state)
     if kind is None or match_constants(framing.words[kind], rows) is not None:
         return None
-    if framing.switches(kind, mode):
+    if framing.switches(kind, state):
         return None
     return check_rows(framing, kind, buffer, rows, int(starts[0]))
 
@@ -110,7 +110,10 @@ def check_rows(
 
 
 def count_leading_matches(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
-    """Count the first rows that have the constants of a type; None if there are none."""
+    """Return how many rows at the start have the constants of a type.
+
+    Returns None if no row has the constants.
+    """
     constants = tuple(
         word for word in framing.words[kind] if word[0] + word[1].itemsize <= rows.shape[1]
     )
@@ -132,25 +135,29 @@ def find_common_step(starts: Indices) -> int:
     return 0
 
 
-def _make_result(framing: Framing, mode: SearchState, frames: Frames) -> PieceResult:
+def _make_result(framing: Framing, state: SearchState, frames: Frames) -> PieceResult:
     """Return the result for a piece, given the frames at the start of the piece."""
-    end = len(frames) * mode.size
+    end = len(frames) * state.size
     rest = frames.buffer[end:]
     need = 0
-    if frames.layout is not None and 0 < len(rest) < mode.size:
-        need = _count_needed(framing, mode, frames.kinds.item(0), frames.layout, rest.tobytes())
+    if frames.layout is not None and 0 < len(rest) < state.size:
+        need = _count_needed(framing, state, frames.kinds.item(0), frames.layout, rest.tobytes())
     return PieceResult(frames, end, need > 0, need)
 
 
 def _count_needed(
-    framing: Framing, mode: SearchState, kind: int, layout: Layout, rest: bytes
+    framing: Framing, state: SearchState, kind: int, layout: Layout, rest: bytes
 ) -> int:
     """Return how many bytes of an incomplete frame are needed to check it further.
 
     Returns 0 if the number is unknown.
     """
     first = next(
-        (other for other in framing.active_types(mode) if _begins_with(framing.marks[other], rest)),
+        (
+            other
+            for other in framing.active_types(state)
+            if _begins_with(framing.marks[other], rest)
+        ),
         None,
     )
     if first != kind or framing.codecs[kind].size != layout.size:
@@ -184,11 +191,11 @@ def _view_rows(buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices) -> By
     return np.ndarray((count, size), np.uint8, buffer, int(starts[0]), (step, 1))
 
 
-def _guess_type(framing: Framing, rows: Bytes2D, mode: SearchState) -> int | None:
+def _guess_type(framing: Framing, rows: Bytes2D, state: SearchState) -> int | None:
     """Return the type whose constants are in the first datagram, or None."""
     first = rows[0].tobytes()
     before = list[int]()
-    for kind in framing.active_types(mode):
+    for kind in framing.active_types(state):
         if framing.codecs[kind].size not in (None, len(first)) or framing.ends[kind] > len(first):
             continue
         constants = framing.marks[kind][:DISTINCTIVE_CONSTANTS]
@@ -201,7 +208,11 @@ def _guess_type(framing: Framing, rows: Bytes2D, mode: SearchState) -> int | Non
 
 
 def _may_have_constants(framing: Framing, kind: int, other: int, rows: Bytes2D) -> bool:
-    """Return whether a row has the constants of the type `kind`."""
+    """Return whether any row may have the constants of the type `kind`.
+
+    Args:
+        other: a type whose constants the rows are assumed to have.
+    """
     if are_contradictory(framing.marks[kind], framing.marks[other]):
         return False
     marked = match_constants(framing.words[kind], rows)

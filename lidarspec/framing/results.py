@@ -53,14 +53,15 @@ COUNTERS_BY_STATUS = {
 
 @dataclass(repr=False)
 class Counters:
-    """Counters of the input.
+    """Counters of the input, and warnings about the data.
 
     ``bytes_in == bytes in frames + bytes_skipped + pending`` always holds.
 
     Attributes:
         frames: the number of frames by type.
-        bytes_filler: the number of skipped bytes that are in declared fillers.
-        pending: the number of bytes that wait because a candidate needs more bytes.
+        bytes_filler: the number of bytes in `bytes_skipped` that are declared fillers, which the
+            sensor sends between frames.
+        pending: the number of bytes that are not decided yet, because a candidate is incomplete.
         bad_checksum, bad_length, implausible: the numbers of rejected candidates, by the reason.
         bad_constant: the number of datagrams without the constants of any frame. In a stream, such
             bytes are not candidates and are skipped.
@@ -128,9 +129,9 @@ class Counters:
         return [failure.traceback for failure in self.failures]
 
     def failure(self, sensor: str) -> PluginError | None:
-        """Return the first error of a plugin; the message has the number of all errors.
+        """Return the first error of the plugin; None if there was no error.
 
-        Returns None if there was no error.
+        Its message states for how many packets or candidates the plugin failed.
         """
         if not self.failures:
             return None
@@ -169,7 +170,8 @@ class Found:
 
     Attributes:
         frame: the name of the frame type.
-        offset: the offset of the frame in the input. Datagrams count as if they were joined.
+        offset: the offset of the frame in the input. For datagrams, it is the offset in the
+            concatenation of all datagrams.
         data: the bytes of the frame.
         at: the arrival time of the bytes that completed the frame, ns; None if unknown.
         gap: the number of bytes that were skipped between the previous frame and this one, without
@@ -198,12 +200,13 @@ class Frames:
         kinds: the index in `names` of the type of each frame; -1 for a datagram that is not a
             frame.
         layouts: the layouts of the frames.
-        forms: the index in `layouts` of the layout of each frame; -1 if unknown.
+        forms: for each frame, the index of its layout in `layouts`; -1 if unknown.
         status: the status of each frame, which is `VALID` or the reason why a candidate is not a
             frame.
-        offsets: the offset of each frame in the whole input. Datagrams count as if they were
-            joined.
-        places: the same offsets, as a range if the frames have one size and follow one another.
+        offsets: the offset of each frame in the whole input. For datagrams, it is the offset in the
+            concatenation of all datagrams.
+        places: the values of `offsets` as a range, if the frames have one size and follow one
+            another; otherwise the same array.
         rows: the bytes of each complete frame as a row, if all have one layout and the rows were
             gathered.
     """

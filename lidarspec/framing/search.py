@@ -33,45 +33,45 @@ MIN_STAY_BYTES = 1 << 12
 
 
 def find_frames(
-    framing: Framing, buffer: Bytes1D, mode: SearchState, base: int, *, final: bool
+    framing: Framing, buffer: Bytes1D, state: SearchState, base: int, *, final: bool
 ) -> PieceResult:
     """Find the frames in one piece of a stream.
 
     Args:
         buffer: the undecided bytes of the last search, and the new bytes.
-        mode: the state between pieces, which is updated.
+        state: the state between pieces, which is updated.
         base: the offset of the buffer in the stream.
         final: whether the stream ends with this piece, so that incomplete candidates are rejected.
     """
-    candidates = Candidates(framing, buffer, mode, final=final)
+    candidates = Candidates(framing, buffer, state, final=final)
     piece = PieceResult(Frames.make_empty(candidates.buffer), len(candidates.buffer))
-    stays = [(0, mode.after)]
+    stays = [(0, state.after)]
     walks = dict[str | None, _FrameWalk]()
     position = 0
     while position < piece.end:
-        after = mode.after
+        after = state.after
         walk = walks.get(after)
         if walk is None:
-            live = candidates.find_live(mode)
+            live = candidates.find_live(state)
             if live is None:
                 piece.end = position
                 break
-            walk = walks[after] = _FrameWalk(framing, candidates, live, mode, base)
+            walk = walks[after] = _FrameWalk(framing, candidates, live, state, base)
         position = walk.advance(position, piece)
-        if mode.after == after:
+        if state.after == after:
             break
-        before = mode.changed
-        mode.changed = base + position
-        if mode.changed - before >= MIN_STAY_BYTES:
+        before = state.changed
+        state.changed = base + position
+        if state.changed - before >= MIN_STAY_BYTES:
             piece.end = position
             break
-        stays.append((position, mode.after))
+        stays.append((position, state.after))
     parts = [frames for walk in walks.values() for frames in walk.frames()]
     if parts:
         piece.frames = Frames.join(parts)
         if len(parts) > 1:
             piece.frames = piece.frames.select(np.argsort(piece.frames.starts))
-        _remember_size(mode, piece.frames, stays[-1][0])
+        _remember_size(state, piece.frames, stays[-1][0])
     count_rejected(framing, piece, candidates, stays)
     return piece
 
@@ -88,11 +88,11 @@ class _FrameWalk:
         framing: Framing,
         candidates: Candidates,
         live: LiveCandidates,
-        mode: SearchState,
+        state: SearchState,
         base: int,
     ) -> None:
         self._framing = framing
-        self._mode = mode
+        self._state = state
         self._base = base
         self._is_whole = candidates.is_whole
         self._frames = frames = live.frames
@@ -109,7 +109,7 @@ class _FrameWalk:
                 stops |= self._after != np.arange(1, len(frames) + 1)
         self._changes = bytes(len(frames))
         if framing.named:
-            changes = framing.find_switching_types(mode)[frames.kinds] & (frames.status == VALID)
+            changes = framing.find_switching_types(state)[frames.kinds] & (frames.status == VALID)
             self._changes = changes.tobytes()
             stops |= changes
         self._stops: list[int] = np.flatnonzero(stops).tolist()
@@ -138,7 +138,7 @@ class _FrameWalk:
             last = self._stops[bisect.bisect_left(self._stops, row)]
             if self._changes[last]:
                 self._accept_rows(row, last)
-                self._mode.after = self._framing.names[frames.kinds.item(last)]
+                self._state.after = self._framing.names[frames.kinds.item(last)]
                 return self._ends.item(last)
             if frames.status.item(last) == SHORT:
                 self._accept_rows(row, last - 1)
@@ -176,29 +176,34 @@ class _FrameWalk:
         if self._runs and last >= first:
             kind = self._frames.kinds.item(last)
             if kind in self._runs:
-                self._mode.run = self._framing.names[kind]
-                self._mode.run_end = self._base + self._ends.item(last)
+                self._state.run = self._framing.names[kind]
+                self._state.run_end = self._base + self._ends.item(last)
 
     def _continue_run(self, position: int) -> int:
         """Extend the run that ends at `position`, and return the new end of the run.
 
         Returns `position` if no run continues there.
         """
-        if self._mode.run_end != self._base + position:
+        if self._state.run_end != self._base + position:
             return position
         for kind, runs in self._runs.items():
-            if self._framing.names[kind] != self._mode.run or self._is_earlier(kind, position):
+            if self._framing.names[kind] != self._state.run or self._has_type_before(
+                kind, position
+            ):
                 continue
             row = runs.find_row(position)
             if row is not None:
                 self._continued.append((kind, position))
                 position = runs.ends.item(row)
-                self._mode.run_end = self._base + position
+                self._state.run_end = self._base + position
                 break
         return position
 
-    def _is_earlier(self, kind: int, position: int) -> bool:
-        """Return whether the candidate at an offset has a type declared before `kind`."""
+    def _has_type_before(self, kind: int, position: int) -> bool:
+        """Return whether the candidate at an offset has a type declared before `kind`.
+
+        Such a candidate takes precedence.
+        """
         starts = self._frames.starts
         row = int(starts.searchsorted(position))
         if row == len(starts) or starts.item(row) != position:
@@ -219,12 +224,16 @@ def _list_rows(runs: Offsets) -> Offsets:
     return rows
 
 
-def _remember_size(mode: SearchState, frames: Frames, since: int) -> None:
-    """Store the size of the frames, and whether they follow one another without gaps."""
+def _remember_size(state: SearchState, frames: Frames, since: int) -> None:
+    """Store the size of the frames, and whether they follow one another without gaps.
+
+    Args:
+        since: the offset of the first frame to compare, which is the last change of active types.
+    """
     own = frames.starts[frames.starts.searchsorted(since) :]
     if len(own):
-        mode.size = frames.sizes.item(-1)
-        mode.is_steady = own.item(-1) - own.item(0) == mode.size * (len(own) - 1)
+        state.size = frames.sizes.item(-1)
+        state.is_steady = own.item(-1) - own.item(0) == state.size * (len(own) - 1)
 
 
 def count_rejected(
@@ -236,7 +245,8 @@ def count_rejected(
     """Count the rejected candidates outside of accepted frames.
 
     Args:
-        stays: pairs of an offset and the value of `SearchState.after` from this offset on.
+        stays: for each set of types that was active, the offset from which on it was active, and
+            the value of `SearchState.after` there.
     """
     frames = piece.frames
     begins = np.array([begin for begin, _ in stays])

@@ -134,9 +134,10 @@ class TextCodec(Codec):
         }
 
     def _decode(self, data: bytes, errors: list[PluginError]) -> tuple[int, bytes | None]:
-        """Decode a complete candidate; return its status and its struct.
+        """Decode a complete candidate; return its status and the bytes of its struct.
 
-        The caller has to check the struct, if there is one.
+        If decoding fails, there is no struct (None). Otherwise, the caller has to check the struct,
+        and the status is not final.
         """
         try:
             decoded = self._coder.decode_whole(data)
@@ -158,7 +159,11 @@ class TextCodec(Codec):
     def _group_by_layout(
         self, structs: Sequence[bytes]
     ) -> tuple[list[LayoutRows], list[tuple[LayoutRefusal, NDArray[np.intp]]]]:
-        """Group structs by layout; return the groups and the refused structs."""
+        """Group structs by layout; return the groups, and the structs without a layout.
+
+        Args:
+            structs: the bytes of each struct.
+        """
         sizes = np.array([len(struct) for struct in structs], np.intp)
         starts = np.cumsum(sizes) - sizes
         joined = np.frombuffer(b"".join(structs), np.uint8)

@@ -68,7 +68,7 @@ class LayoutFamilies:
     def split(
         self, groups: list[LayoutGroup], make_checker: MakeChecker
     ) -> tuple[list[JointChecker], list[LayoutGroup]]:
-        """Return checkers for the groups to check together, and the groups to check one by one."""
+        """Return checkers for the groups to check together, and all other groups."""
         if len(groups) < MANY_LAYOUTS:
             return [], groups
         left = list[LayoutGroup]()
@@ -94,11 +94,11 @@ class LayoutFamilies:
     def find_family(self, layout: Layout, checker: CandidateChecker) -> LayoutFamily | None:
         """Return the family of a layout; None if its candidates must be checked alone."""
         if self not in layout.notes:  # decoders of one frame type share its layouts
-            layout.notes[self] = self._find(layout, checker)
+            layout.notes[self] = self._make_family(layout, checker)
         family: LayoutFamily | None = layout.notes[self]
         return family
 
-    def _find(self, layout: Layout, checker: CandidateChecker) -> LayoutFamily | None:
+    def _make_family(self, layout: Layout, checker: CandidateChecker) -> LayoutFamily | None:
         if layout.regions or not all(_ignores_trailing_zeros(seal) for seal in layout.seals):
             return None
         constants = tuple(sorted(layout.constants.items()))
@@ -146,7 +146,8 @@ class JointChecker:
     Attributes:
         which: the indices of all candidates, (n,).
         forms: the index of each candidate's layout, (n,).
-        is_final: whether all tests are done. If not, valid candidates have to be checked further.
+        is_complete: whether `check` applies all checks. If not, the candidates that pass have to be
+            checked layout by layout.
     """
 
     def __init__(
@@ -162,7 +163,7 @@ class JointChecker:
         self._sizes = np.array([layout.size for layout in self.layouts], np.intp)
         self._lengths = np.array([family.lengths for family in families], np.intp).T
         first = make_checker(self.layouts[0])
-        self.is_final = first.is_complete and all(
+        self.is_complete = first.is_complete and all(
             isinstance(check, LookupCondition) for check in first.checks
         )
 

@@ -16,7 +16,7 @@ from lidarspec.errors import SpecError
 from lidarspec.frames.encode import find_kind, set_count
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows
 from lidarspec.frames.layout import Layout
-from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, find_layout
+from lidarspec.frames.layout_tree import InvalidLengthError, UnknownSelectorError, find_layout
 from lidarspec.frames.schema import make_schema, without_indices
 from lidarspec.frames.wire_coder import Coder, frame_coder
 from lidarspec.framing.frame_engine import get_codec
@@ -266,7 +266,7 @@ class FrameMaker:
             except UnknownSelectorError as unknown:
                 self._layout_fields.append(unknown.leaf.info.path)
                 self._layouts.clear()
-            except TooLongError as error:
+            except InvalidLengthError as error:
                 raise self._make_too_long_error(values, str(error)) from None
 
     def _make_too_long_error(self, values: Values, path: str) -> SpecError:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import SpecError, UnknownCommand, UnknownFrame, UsageError
 from lidarspec.frames.commands import ArgumentSlot, find_argument_slot
 from lidarspec.frames.layout import Leaf
-from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, find_layout
+from lidarspec.frames.layout_tree import InvalidLengthError, UnknownSelectorError, find_layout
 from lidarspec.frames.parse import parse
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.framing.example_frames import LOW_NUMBERS, draw_frame, iter_switch_keys
@@ -378,7 +378,7 @@ def _headers(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> Header
                 header[asked] = draw(fields[asked])
             else:
                 header[asked] = draw(_header_values(sensor, frame, info))
-        except (TooLongError, ArithmeticError, LookupError, TypeError, ValueError):
+        except (InvalidLengthError, ArithmeticError, LookupError, TypeError, ValueError):
             # The last drawn value is invalid: with the values before it, there was a next field.
             if not header.get(asked):
                 return draw(st.sampled_from(find_headers(sensor, frame)))

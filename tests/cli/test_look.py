@@ -111,7 +111,7 @@ def lidarspec_sensors():
     )
     done = ran("show", file)
     assert "ask (to the sensor): 2 bytes" in done.stdout
-    assert "commands.start: values and args have no value for field 'value'" in done.stderr
+    assert "commands.start: neither `values` nor `args` gives the field 'value'" in done.stderr
     assert f"next: lidarspec check {file}" in done.stderr
 
 

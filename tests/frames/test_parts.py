@@ -294,7 +294,7 @@ def test_a_part_that_is_longer_than_the_parts_is_cut_off_by_their_end() -> None:
     part = Struct("n" / Int8ub, "text" / Bytes(this.n))
     struct = Struct("size" / Int8ub, "parts" / Parts(part, within=this.size), "end" / Bytes(4))
     with pytest.raises(
-        WireError, match=r"the parts end at byte 4: parts\[0\].text requires 5 bytes"
+        WireError, match=r"the sequence of parts ends at byte 4: parts\[0\].text requires 5 bytes"
     ):
         against_construct.sensor(struct).parse(b"\3\5abcdef")
 

@@ -98,7 +98,7 @@ def test_a_part_begins_where_the_one_before_it_ends() -> None:
     rows = {row.field: row for row in wire_table(SHAPES["shape-segments"].frames["data"])}
     chain = (
         "the first part has first_size bytes; next_size in each part is the size of the next part"
-        " (0: last part)"
+        ", or 0 in the last part"
     )
     assert rows["segments"] == WireRow("9", "size(segments)", "parts", "segments", "", chain)
     assert rows["segments[i].time"].offset == "4 + at(segments[i])"
