@@ -61,7 +61,7 @@ from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.results import Points
 from lidarspec.spec.syntax import iter_seals, prepare
-from lidarspec.trusted_files import own_settings, read_document
+from lidarspec.trusted_files import read_document, user_settings_path
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -404,7 +404,7 @@ class Registry:
             claiming = list(dict.fromkeys(home[0] for home in self._claims[name]))
             error = UsageError(
                 f"{name}: {' and '.join(claiming)} each contain a sensor with this name; choose"
-                f" one of these distributions in {own_settings()}, below [owners]: {name} ="
+                f" one of these distributions in {user_settings_path()}, below [owners]: {name} ="
                 f' "{claiming[0]}"'
             )
             raise suggest(error, "lidarspec plugins")
@@ -658,7 +658,7 @@ def named_owners() -> dict[str, str]:
 
     Invalid settings cause a Python warning.
     """
-    file = own_settings()
+    file = user_settings_path()
     try:
         if file.is_file():
             named = read_document(file).get("owners", {})

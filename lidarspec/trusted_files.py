@@ -40,13 +40,13 @@ def user_folder() -> Path:
     return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "lidarspec"
 
 
-def own_settings() -> Path:
+def user_settings_path() -> Path:
     """Return the path of the user's own settings file; the file may be missing."""
     return user_folder() / FILE
 
 
 def find_distrust(path: Path) -> str:
-    """Return the reason why a file is not the user's own; "" if it is.
+    """Return the reason why a file cannot be trusted as the user's own; "" if it can.
 
     The file and its folder must belong to the user, and must not be writable by all users. On
     systems without file owners, all files in the user's folder are the user's own.
@@ -120,8 +120,8 @@ def trust(folder: str | Path) -> Path:
     return allowed
 
 
-def resolve_beside(folder: Path, value: object) -> Path:
-    """Return the path of a file in a folder.
+def resolve_inside(folder: Path, value: object) -> Path:
+    """Return the path of a file in a folder or below.
 
     Args:
         value: the path of the file relative to the folder, from an untrusted source.

@@ -26,8 +26,12 @@ def path_while_written(path: Path) -> Path:
     return path.with_name(f".{os.getpid()}.{path.name}")
 
 
-def remove_abandoned(path: Path) -> None:
-    """Remove the temporary files that killed processes have left for a path."""
+def remove_abandoned_files(path: Path) -> None:
+    """Remove the temporary files that killed processes have left beside their destination.
+
+    Args:
+        path: the destination of the temporary files; it is not removed.
+    """
     for process, name in _list_unfinished(path.parent.absolute()):
         left = path.with_name(f".{process}.{name}")
         with contextlib.suppress(OSError, SourceError):

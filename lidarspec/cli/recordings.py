@@ -382,7 +382,7 @@ def _print_summary(
     if played.late:
         note(
             f"{played.late} chunks were sent more than {LATE_NS // 1_000_000} ms late; the longest"
-            f" delay was {played.latest / 1e6:.0f} ms"
+            f" delay was {played.greatest_delay_ns / 1e6:.0f} ms"
         )
     if len(played.senders) > 1 and not is_file:
         note(
@@ -400,6 +400,6 @@ def _print_summary(
             "sha256": played.digest.hexdigest(),
             "seconds": played.seconds,
             "late": played.late,
-            "latest_ns": played.latest,
+            "latest_ns": played.greatest_delay_ns,
         }
         emit_json(summary, None)

@@ -39,7 +39,7 @@ from lidarspec.transports.protocol import no_bytes_message
 from lidarspec.transports.udp import (
     REQUESTED_BUFFER_BYTES,
     describe_small_buffer,
-    enlarge_buffer_command,
+    make_sysctl_command,
 )
 from lidarspec.transports.usb_adapters import list_missing_drivers
 
@@ -157,7 +157,7 @@ def _check_usb_drivers() -> Iterator[Diagnosis]:
 
 def _check_permission(port: str) -> Iterator[Diagnosis]:
     """Yield a finding if the user has no permission to open a serial port."""
-    if ports.is_allowed(port):
+    if ports.can_open(port):
         return
     group = ports.find_group(port)
     text = f"no permission to open {port}"
@@ -194,14 +194,14 @@ def _examine_udp(
     yield from _check_buffer()
     if problems:
         return
-    before = ports.received_per_interface()
+    before = ports.count_received_packets()
     began = time.monotonic()
     findings = list(_examine_bytes(source, sensor, seconds))
     yield from findings
     if any(finding.is_silence for finding in findings):
         rates = {
             name: (count - before.get(name, count)) / (time.monotonic() - began)
-            for name, count in ports.received_per_interface().items()
+            for name, count in ports.count_received_packets().items()
         }
         yield from _check_interfaces(numbers, host, rates)
 
@@ -246,7 +246,7 @@ def _check_buffer() -> Iterator[Diagnosis]:
         yield Diagnosis(
             False,
             describe_small_buffer(REQUESTED_BUFFER_BYTES, granted),
-            enlarge_buffer_command(REQUESTED_BUFFER_BYTES),
+            make_sysctl_command(REQUESTED_BUFFER_BYTES),
         )
 
 

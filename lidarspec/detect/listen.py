@@ -23,7 +23,13 @@ from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.base import find_data_link
 from lidarspec.transports.open_url import live_address, open_live, open_transport
-from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, endpoint, name_senders
+from lidarspec.transports.protocol import (
+    Chunk,
+    Disconnected,
+    LiveTransport,
+    format_sender,
+    name_senders,
+)
 
 #: The maximum number of datagrams to read from a file.
 MAX_FILE_DATAGRAMS = 400
@@ -157,7 +163,7 @@ def _make_sender_warnings(opened: LiveTransport) -> tuple[str, ...]:
     """Return a warning if datagrams came, but none from the requested sender."""
     if opened.other_sender is None:
         return ()
-    example = endpoint(opened.other_sender)
+    example = format_sender(opened.other_sender)
     others = f"{opened.foreign} datagrams came from other senders, such as {example}"
     return (f"{opened.label}: no data from the requested sender; {others}",)
 

@@ -29,7 +29,7 @@ from lidarspec.spec.links import Serial, Tcp
 from lidarspec.transports.base import find_data_link
 from lidarspec.transports.destinations import make_simulated_outlet
 from lidarspec.transports.outlets import LOCALHOST, has_terminals
-from lidarspec.transports.serving import Served
+from lidarspec.transports.serving import ServedSensor
 
 #: The time limit for all scans is this time plus one second for each scan.
 EXTRA_TIMEOUT_S = 15.0
@@ -125,7 +125,7 @@ def _run_live(
             device = stack.enter_context(
                 open_device(outlet.source, sensor, start=False, record=path)
             )
-            served = stack.enter_context(Served(simulated, outlet))
+            served = stack.enter_context(ServedSensor(simulated, outlet))
             return outlet.source, *_read(device, served, scan_count)
     if has_terminals() and find_data_link(sensor, Serial):
         destination = "pty"
@@ -135,14 +135,16 @@ def _run_live(
     link = find_data_link(sensor, Tcp)
     patient = link is None or not link.reported
     with (
-        Served(simulated, make_simulated_outlet(sensor, destination), patient=patient) as served,
+        ServedSensor(
+            simulated, make_simulated_outlet(sensor, destination), patient=patient
+        ) as served,
         open_device(served.path, sensor, start=False, record=path) as device,
     ):
         return served.path, *_read(device, served, scan_count)
 
 
 def _read(
-    device: Device, served: Served, scan_count: int
+    device: Device, served: ServedSensor, scan_count: int
 ) -> tuple[tuple[Reply, ...], tuple[Scan, ...], Counters]:
     replies = tuple(device.send(name) for name in device.sensor.on_open)
     limit = time.monotonic() + EXTRA_TIMEOUT_S + scan_count

@@ -13,7 +13,7 @@ from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.addresses import with_option
-from lidarspec.transports.protocol import LiveTransport, Sender, endpoint
+from lidarspec.transports.protocol import LiveTransport, Sender, format_sender
 
 #: A warning is issued if bytes arrive for this time without containing a frame.
 FRAMELESS_WARNING_S = 0.9
@@ -122,7 +122,7 @@ class LinkState:
         """Return the shell command, or the action, that helps with the current problem."""
         other = self._other_sender
         if other is not None and self.name == "silent":
-            chosen = with_option(self._source, "src", endpoint(other))
+            chosen = with_option(self._source, "src", format_sender(other))
             return f"repeat with {quote(chosen)} to read the other sender"
         if self._decoder.stats.bytes_in and not self._decoder.stats.frames:
             return f"lidarspec detect {quote(str(self._source).partition('?')[0])}"
@@ -141,7 +141,7 @@ class LinkState:
         count = self._senders.foreign + self._transport.foreign
         return (
             f"no data received from the sensor for {seconds}, but {count} datagrams from other"
-            f" senders, such as {endpoint(other)}"
+            f" senders, such as {format_sender(other)}"
         )
 
     @property

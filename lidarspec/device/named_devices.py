@@ -37,9 +37,9 @@ from lidarspec.trusted_files import (
     FILE,
     find_distrust,
     is_trusted,
-    own_settings,
     read_document,
-    resolve_beside,
+    resolve_inside,
+    user_settings_path,
 )
 
 #: pattern of a valid name. Such a name cannot be mistaken for a file, a URL, or a port on Windows.
@@ -115,7 +115,7 @@ class NamedDevice:
             )
         elif os.path.isfile(file):
             try:
-                resolve_beside(folder, os.path.abspath(file))
+                resolve_inside(folder, os.path.abspath(file))
             except UsageError:
                 reason = f"source {self.source!r} is a file outside {folder}"
         if not reason:
@@ -197,7 +197,7 @@ def find_settings_files() -> list[Path]:
 
     Files of other users are skipped with a warning.
     """
-    own = own_settings()
+    own = user_settings_path()
     here = Path.cwd()
     paths = [own] if os.path.isfile(own) else []
     for path in (folder / FILE for folder in (here, *here.parents)):
@@ -217,9 +217,11 @@ def read_settings_file(path: Path) -> dict[str, NamedDevice]:
         SourceError: if the file cannot be read.
     """
     content = read_document(path)
-    is_own = path == own_settings()
+    is_own = path == user_settings_path()
     if "owners" in content and not is_own:
-        raise UsageError(f"{path}: [owners] is only allowed in your own settings, {own_settings()}")
+        raise UsageError(
+            f"{path}: [owners] is only allowed in your own settings, {user_settings_path()}"
+        )
     _check_keys(path, "", content, ["device", "owners"])
     tables = content.get("device", {})
     if not isinstance(tables, dict) or not all(

@@ -20,7 +20,7 @@ from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.addresses import with_option
-from lidarspec.transports.protocol import Chunk, Sender, endpoint
+from lidarspec.transports.protocol import Chunk, Sender, format_sender
 
 #: Maximum number of senders that are examined to find the sensor; also the maximum number of stored
 #: ports.
@@ -72,7 +72,8 @@ class SenderCheck:
 
     def _make_error(self, first: Sender, other: Sender) -> UsageError:
         one, two = (
-            endpoint(sender) if first[0] == other[0] else sender[0] for sender in (first, other)
+            format_sender(sender) if first[0] == other[0] else sender[0]
+            for sender in (first, other)
         )
         chosen = with_option(self._source, "src", one)
         error = UsageError(
@@ -128,10 +129,10 @@ class SenderFilter(SenderCheck):
         if self.other_sender is None or self._address is None:
             return []
         text = (
-            f"{self._source}: reading data from {endpoint(self._address)}, and ignoring data from"
-            f" {endpoint(self.other_sender)}"
+            f"{self._source}: reading data from {format_sender(self._address)}, and ignoring data"
+            f" from {format_sender(self.other_sender)}"
         )
-        other = quote(with_option(self._source, "src", endpoint(self.other_sender)))
+        other = quote(with_option(self._source, "src", format_sender(self.other_sender)))
         return [f"{text}; next: repeat with {other} to read the other sender"]
 
     def select(self, chunks: Sequence[Chunk]) -> list[Chunk]:

@@ -37,7 +37,7 @@ from lidarspec.transports.files import (
     StreamCaptureTransport,
 )
 from lidarspec.transports.open_url import is_live, open_transport
-from lidarspec.transports.protocol import Chunk, Sender, Transport, endpoint
+from lidarspec.transports.protocol import Chunk, Sender, Transport, format_sender
 from lidarspec.transports.robotics_logs import BagTransport
 from lidarspec.view.live_frames import open_live
 from lidarspec.view.rate_meter import MeterReading
@@ -197,7 +197,7 @@ class FileContents:
                 {
                     **vars(flow),
                     **{
-                        end: address and endpoint(address)
+                        end: address and format_sender(address)
                         for end in ("sender", "receiver")
                         if [address := getattr(flow, end)]
                     },
@@ -398,11 +398,14 @@ def _make_rows(contents: FileContents) -> Sequence[tuple[str, str]]:
     for flow in contents.flows[:MAX_LISTED_FLOWS]:
         if flow.sender is not None:
             if flow.receiver is not None:
-                to = f" to {endpoint(flow.receiver)}"
+                to = f" to {format_sender(flow.receiver)}"
             else:
                 to = ""
             lines.append(
-                ("from", f"{endpoint(flow.sender)}{to}: {flow.packets} packets, {flow.bytes} bytes")
+                (
+                    "from",
+                    f"{format_sender(flow.sender)}{to}: {flow.packets} packets, {flow.bytes} bytes",
+                )
             )
     if further := contents.flows[MAX_LISTED_FLOWS:]:
         lines.append(

@@ -23,7 +23,7 @@ from lidarspec.errors import SourceError, UsageError, suggest, system_errors
 from lidarspec.points.cloud import COLUMNS, PointCloud
 from lidarspec.remote_files import remove
 from lidarspec.scans.scan import Scan
-from lidarspec.unfinished_files import path_while_written, remove_abandoned
+from lidarspec.unfinished_files import path_while_written, remove_abandoned_files
 
 #: For the suffix of each format that writes a folder, a pattern of the files in the folder. A
 #: folder that contains any other file is not replaced.
@@ -48,7 +48,7 @@ def replace_file(path: Path) -> Iterator[Path]:
         UsageError: if the path is a folder with files that do not belong to its format.
     """
     refuse_foreign_files(path)
-    remove_abandoned(path)
+    remove_abandoned_files(path)
     part = path_while_written(path)
     try:
         with contextlib.suppress(SourceError):

@@ -19,7 +19,7 @@ from typing import Any, Literal, Protocol, Self
 
 from lidarspec.errors import SourceError, SourceTimeout, UsageError, WriteError, failure_reason
 from lidarspec.transports.protocol import Chunk
-from lidarspec.unfinished_files import path_while_written, remove_abandoned
+from lidarspec.unfinished_files import path_while_written, remove_abandoned_files
 
 #: records are written when their total size reaches this limit.
 FLUSH_BYTES = 1 << 16
@@ -58,7 +58,7 @@ class RecordingFile:
         self.replaces = overwrite and self._place.is_file() and can_rename_open_files
         self._opened = self._place
         if self.replaces:
-            remove_abandoned(self._place)
+            remove_abandoned_files(self._place)
             self._opened = path_while_written(self._place)
         try:
             self._file = open(self._opened, "wb" if overwrite else "xb", buffering=0)  # noqa: SIM115  closed by `close`

@@ -42,7 +42,7 @@ from lidarspec.spec.links import Link, Tcp, is_datagram
 from lidarspec.spec.options import Learned, OptionType, option_types
 from lidarspec.spec.results import Imu, Points
 from lidarspec.spec.timing import EPOCHS, HOUR_S, Clock, OnChange, OnWrap, PacketCounter, Split
-from lidarspec.trusted_files import resolve_beside
+from lidarspec.trusted_files import resolve_inside
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -573,7 +573,7 @@ class Configure:
                 checked[name] = Learned.of_dict(value)
             elif name in self.files and value is not None:
                 try:
-                    checked[name] = resolve_beside(folder, value)
+                    checked[name] = resolve_inside(folder, value)
                 except UsageError as error:
                     raise UsageError(f"{name}: {error}") from None
             elif not isinstance(value, bool | int | float | None) and not is_word:

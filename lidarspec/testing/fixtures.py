@@ -13,7 +13,7 @@ from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Scene
 from lidarspec.transports.destinations import make_simulated_outlet
-from lidarspec.transports.serving import Served, VirtualClock
+from lidarspec.transports.serving import ServedSensor, VirtualClock
 
 
 @contextlib.contextmanager
@@ -27,7 +27,7 @@ def virtual_port(
     rate: float = 1.0,
     faults: Faults | None = None,
     virtual_time: bool = False,
-) -> Iterator[Served]:
+) -> Iterator[ServedSensor]:
     """Run a simulated sensor on a pseudo-terminal or a socket, in a context manager.
 
     Args:
@@ -66,4 +66,4 @@ def virtual_port(
             )
         outlet = make_simulated_outlet(resolved, to, link)
         clock = VirtualClock() if virtual_time else None
-        yield stack.enter_context(Served(device, outlet, clock=clock))
+        yield stack.enter_context(ServedSensor(device, outlet, clock=clock))

@@ -14,7 +14,7 @@ import pytest
 if TYPE_CHECKING:
     from lidarspec.plugins import Registry
     from lidarspec.sensor_operations import Sensor
-    from lidarspec.transports.serving import Served
+    from lidarspec.transports.serving import ServedSensor
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -47,7 +47,7 @@ def sensor(request: pytest.FixtureRequest) -> Sensor:
 
 
 @pytest.fixture
-def virtual_port(request: pytest.FixtureRequest) -> Iterator[Callable[..., Served]]:
+def virtual_port(request: pytest.FixtureRequest) -> Iterator[Callable[..., ServedSensor]]:
     """Put a simulated sensor on a real port until the test ends.
 
     The fixture is a function like `lidarspec.testing.fixtures.virtual_port`. Its first argument is
@@ -57,7 +57,7 @@ def virtual_port(request: pytest.FixtureRequest) -> Iterator[Callable[..., Serve
 
     with ExitStack() as stack:
 
-        def serve_sensor(wanted: Any = None, **more: Any) -> Served:
+        def serve_sensor(wanted: Any = None, **more: Any) -> ServedSensor:
             return stack.enter_context(
                 ports.virtual_port(wanted or request.getfixturevalue("sensor"), **more)
             )

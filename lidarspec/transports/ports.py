@@ -26,8 +26,9 @@ class SerialPort:
 
     Attributes:
         path: the name of the port, such as "/dev/ttyUSB0" or "COM4".
-        lasting: a name of the port that does not depend on the USB socket; "" if there is none.
-        allowed: whether the current user may open the port.
+        lasting: a path of the port that stays the same if the device is plugged into another USB
+            socket; "" if there is none.
+        allowed: whether the person who runs lidarspec may open the port.
         users: the programs that have opened the port, if the system shows them.
     """
 
@@ -67,7 +68,7 @@ def list_serial_ports() -> list[SerialPort]:
                 path,
                 f"{description}{maker}".strip(),
                 find_lasting_path(path),
-                is_allowed(path),
+                can_open(path),
                 find_users(path),
             )
         )
@@ -87,14 +88,17 @@ def find_lasting_path(port: str) -> str:
     )
 
 
-def is_allowed(port: str) -> bool:
-    """Return whether the user may open a port; True for a port that is not a file."""
+def can_open(port: str) -> bool:
+    """Return whether the user may open a port; True if the port is no file, as on Windows."""
     effective = os.access in os.supports_effective_ids
     return not os.path.exists(port) or os.access(port, os.R_OK | os.W_OK, effective_ids=effective)
 
 
 def find_group(port: str) -> str:
-    """Return the user group that may open a port; "" for no group or an unknown group."""
+    """Return the name of the user group that may open a port.
+
+    Returns "" if no group other than root's may open the port, or if the group has no name.
+    """
     with contextlib.suppress(OSError, KeyError):
         status = os.stat(port)
         if grp is not None and status.st_mode & 0o060 == 0o060 and status.st_gid:
@@ -152,7 +156,7 @@ def _read_links(folder: Path) -> Iterator[str]:
             yield os.readlink(folder / name)
 
 
-def received_per_interface() -> dict[str, int]:
+def count_received_packets() -> dict[str, int]:
     """Return the number of packets that each network interface has received.
 
     Returns:

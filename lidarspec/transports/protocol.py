@@ -26,9 +26,9 @@ Sender = tuple[str, int]
 
 @dataclass(frozen=True)
 class Origin:
-    """A requested sender: an address with or without a port.
+    """The sender whose datagrams the user wants: an address with or without a port.
 
-    ``sender in origin`` is true if the `Sender` matches.
+    ``sender in origin`` is true if the `Sender` has this address, and this port if a port is given.
     """
 
     host: str
@@ -36,7 +36,7 @@ class Origin:
 
     @classmethod
     def parse(cls, text: str) -> Origin:
-        """Return the requested sender for a text ADDRESS or ADDRESS:PORT.
+        """Return the wanted sender for a text ADDRESS or ADDRESS:PORT.
 
         Examples are "192.168.1.201", "192.168.1.201:2368", "fe80::1" and "[fe80::1]:2368".
 
@@ -59,7 +59,7 @@ class Origin:
         return sender is not None and sender[0] == self.host and self.port in (None, sender[1])
 
 
-def endpoint(sender: Sender) -> str:
+def format_sender(sender: Sender) -> str:
     """Return a sender as text: "192.168.1.201:2368" or "[fe80::1]:2368"."""
     if ":" in sender[0]:
         return f"[{sender[0]}]:{sender[1]}"
@@ -81,10 +81,15 @@ def name_senders(ends: Iterable[tuple[Sender | None, Sender | None]]) -> dict[Se
         if sender is not None:
             ports[sender[0], receiver and receiver[1]].add(sender[1])
     shared = {host for (host, _), sending in ports.items() if len(sending) > 1}
-    return {
-        sender: "" if sender is None else endpoint(sender) if sender[0] in shared else sender[0]
-        for sender, _ in pairs
-    }
+    names: dict[Sender | None, str] = {}
+    for sender, _ in pairs:
+        if sender is None:
+            names[sender] = ""
+        elif sender[0] in shared:
+            names[sender] = format_sender(sender)
+        else:
+            names[sender] = sender[0]
+    return names
 
 
 @dataclass(frozen=True)
@@ -95,7 +100,7 @@ class Format:
         suffix: the suffix including the dot, ".csv".
         description: a short description for lists.
         write: writes scans to a path. With `every_point`, points without a return are written too.
-        holds: the names of optional features that the format supports:
+        holds: the optional features that the format supports:
             "organized": points in rows and columns. `write` then accepts `organized=True` with one
             scan.
             "scans": each scan is stored separately, in rows and columns if it has them.
@@ -166,9 +171,10 @@ class Transport(ABC):
         foreign: number of datagrams from senders other than the requested sender.
         kernel_drops: number of datagrams that the system dropped because they were not read in
             time.
-        disconnects: number of interruptions that a recording reports.
+        disconnects: how often the device was disconnected during a recording; 0 for other sources.
         unread: number of bytes that could not be read from a damaged file.
-        stored: the open file before decompression; None if the source is not a file.
+        stored: the open file in its stored form, which may be compressed; None if the source is not
+            a file.
     """
 
     datagrams: bool = False
@@ -250,9 +256,10 @@ class LiveTransport(Transport):
         label: the SOURCE, for messages.
         closed: whether the transport was closed. `chunks` then ends.
         overflow: the default policy for a full queue of chunks: "drop_oldest", or "block" for a
-            source that waits for its reader.
+            source that loses nothing if it is read late, such as a simulated device without a rate.
         silence: number of seconds without a byte after which an incomplete frame is discarded.
-        other_sender: the sender of the last datagram in `foreign`; None if there was none.
+        other_sender: the sender of the last datagram that was counted in `foreign`; None if no
+            datagram was counted.
     """
 
     label: str = ""
@@ -263,7 +270,7 @@ class LiveTransport(Transport):
 
     @property
     def addressed(self) -> bool:
-        """Whether `write` has a destination.
+        """Whether the destination of `write` is known.
 
         False for a source of datagrams while the address of the sensor is unknown.
         """
@@ -289,9 +296,12 @@ class LiveTransport(Transport):
         """
 
     def accept(self, sender: Sender) -> None:
-        """Set the destination of `write` to the detected sensor.
+        """Use a sender of valid frames as the destination of `write` from now on.
 
-        A source with a fixed destination ignores this.
+        A source with a fixed destination ignores this call.
+
+        Args:
+            sender: the address and port of the sensor.
         """
 
     @abstractmethod
@@ -323,7 +333,11 @@ class LiveTransport(Transport):
             yield from self.read(POLL_S)
 
     def lines(self, *, dtr: bool | None = None, rts: bool | None = None) -> None:
-        """Set the control lines of a serial port; None leaves a line unchanged.
+        """Set the control lines of a serial port.
+
+        Args:
+            dtr: the new state of the line DTR; None to leave the line unchanged.
+            rts: the new state of the line RTS; None to leave the line unchanged.
 
         Raises:
             UsageError: if the source has no control lines.
@@ -331,10 +345,14 @@ class LiveTransport(Transport):
         raise UsageError(f"{self.label}: only a serial port has control lines")
 
     def link(self, name: str) -> LiveTransport | None:
-        """Open the transport of another link of the same device.
+        """Open another link of the same device, such as the TCP port for commands.
+
+        Args:
+            name: the name of the link in `Sensor.links`.
 
         Returns:
-            The transport; None if the caller must open the link by its address.
+            The transport of the link. None if this transport cannot open the link; the caller then
+            opens the link by the address of the device.
         """
         return None
 

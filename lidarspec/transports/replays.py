@@ -1,7 +1,10 @@
 """Send the bytes of a recording at their recorded times, or at another speed.
 
+The bytes are sent to an outlet (a port or socket of this computer that other programs read), or to
+a file.
+
 All deadlines are computed from the deadline of the first chunk, so that delays do not add up. A
-late chunk is sent at once.
+late chunk is sent immediately.
 """
 
 from __future__ import annotations
@@ -54,7 +57,7 @@ class Deadlines:
         return self._start + round((at - self._origin) / self._speed)
 
 
-def iter_paced(
+def iter_at_deadlines(
     chunks: Iterable[Chunk],
     *,
     speed: float | None = 1.0,
@@ -84,15 +87,15 @@ class Replay:
         file: the SOURCE of a recording, capture or raw file.
         destination: an outlet, or a new file; it is not closed.
         speed: 2.0 is twice as fast as recorded; None is as fast as possible.
-        needs_times: whether a file without times is an error. Otherwise, the file is sent as fast
-            as possible.
+        needs_times: whether a file without times is an error. If False, a file without times is
+            sent as fast as possible.
         loop: whether to start again at the end.
         source: the open transport of the file, for example standard input; None to open the file.
         times: the range of arrival times to send, as for `Selection(times=...)`.
 
     Attributes:
         late: number of chunks that were sent more than 20 ms late.
-        latest: the greatest delay of a chunk, ns.
+        greatest_delay_ns: the greatest delay of a chunk.
         is_timed: whether the chunks of the file have times.
         digest: SHA-256 of all bytes.
     """
@@ -120,7 +123,7 @@ class Replay:
         self.chunks = 0
         self.bytes = 0
         self.late = 0
-        self.latest = 0
+        self.greatest_delay_ns = 0
         self.is_timed = True
         self.digest = hashlib.sha256()
 
@@ -135,9 +138,11 @@ class Replay:
         return set(name_senders(self._endpoints).values()) - {""}
 
     def run(self) -> Iterator[str]:
-        """Send the file once, or repeatedly if `loop` is set; yield messages.
+        """Send the file once, or repeatedly if `loop` is set.
 
-        Yields "" after each chunk without a message.
+        Yields:
+            "" after each sent chunk, so that the caller can show the progress or stop. In between,
+            messages for the user, for example that the reader has disconnected.
 
         Raises:
             UsageError: if the file has no times, but they are required.
@@ -163,7 +168,7 @@ class Replay:
         with contextlib.closing(opened) as source:
             chunks = self._check_times(iter_received(source, self._times, self._file))
             try:
-                for chunk, late_ns in iter_paced(chunks, speed=self._speed):
+                for chunk, late_ns in iter_at_deadlines(chunks, speed=self._speed):
                     self._send(chunk)
                     self._count(chunk, late_ns)
                     yield ""
@@ -197,5 +202,5 @@ class Replay:
         self.digest.update(chunk.data)
         if late_ns > LATE_NS:
             self.late += 1
-        self.latest = max(self.latest, late_ns)
+        self.greatest_delay_ns = max(self.greatest_delay_ns, late_ns)
         self._endpoints.add((chunk.sender, chunk.receiver))

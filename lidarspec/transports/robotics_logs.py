@@ -1,8 +1,9 @@
 """Read packets from robotics logs: ROS 1 bags, ROS 2 bags and MCAP files.
 
-A driver publishes a packet, or a list of the packets of a scan, as a message. A message type
-contains packets if it has a field `packets`, or "packet" in its name. The bytes are in the field
-`data` or `buf` of a packet. A packet may also have the fields `size` (number of bytes) and `stamp`.
+A driver publishes a packet, or a list of the packets of a scan, as a message. This module assumes
+that a message type contains packets if the type has a field `packets`, or if the name of the type
+contains "packet". The bytes are in the field `data` or `buf` of a packet. A packet may also have
+the fields `size` (number of bytes) and `stamp`.
 
 Some logs contain no definitions of their messages. Their messages are read with the definition in
 `FALLBACK_DEFINITIONS` that matches the length of the message.
@@ -90,8 +91,9 @@ def find_log_kind(path: str, head: bytes = b"") -> LogKind | None:
 class BagTransport(Transport):
     """Reads the packets of a robotics log, in the order of its messages.
 
-    The time of a packet is its own stamp, or else the stamp of its message or the time of logging.
-    If several namespaces have packets, the `sender` of each chunk is its namespace.
+    The time of a packet is the first of these times that exists: the stamp of the packet, the stamp
+    of its message, the time of logging. If several namespaces have packets, the `sender` of each
+    chunk is its namespace.
 
     Args:
         sender: yield only the packets of this namespace or topic; None for all.
@@ -147,7 +149,7 @@ class BagTransport(Transport):
                     sender = None
                 message = self._deserialize(link, raw)
                 if link.msgtype == RAW:
-                    yield raw_chunk(message)
+                    yield read_chunk(message)
                     continue
                 message_ns = _read_stamp(getattr(message, "header", None)) or log_time_ns
                 for packet in getattr(message, "packets", [message]) if message is not None else ():
@@ -161,7 +163,7 @@ class BagTransport(Transport):
                     )
 
     def _is_stream(self, link: Any) -> bool:
-        """Return whether the packets of a connection are portions of a byte stream."""
+        """Return whether the packets of a topic are portions of a byte stream."""
         if link.msgtype != RAW:
             return False
         first = next(
@@ -206,8 +208,10 @@ class BagTransport(Transport):
             ) from error
 
 
-def raw_chunk(message: Any) -> Chunk:
-    """Return the packet in a message that lidarspec wrote.
+def read_chunk(message: Any) -> Chunk:
+    """Return the chunk in a message that lidarspec wrote.
+
+    The chunk is a datagram or a portion of a byte stream, with its arrival time.
 
     Args:
         message: a std_msgs/UInt8MultiArray of rosbags or rclpy.

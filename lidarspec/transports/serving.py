@@ -1,7 +1,9 @@
-"""Run a simulated sensor at an outlet, in real time.
+"""Run a simulated sensor at an outlet, in real time or in virtual time.
 
-A loop sends the bytes of the device to the outlet, and the commands from the outlet to the device.
-`serve` runs the loop in the calling thread, and `Served` runs it in a new thread.
+An outlet is a port or socket of this computer to which other programs connect, as they connect to a
+sensor. A loop sends the bytes of the simulated device to the outlet, and the commands from the
+outlet to the device. `serve` runs the loop in the calling thread, and `ServedSensor` runs the loop
+in a new thread.
 """
 
 from __future__ import annotations
@@ -34,9 +36,10 @@ _VIRTUAL_STEP_NS = 20_000_000
 
 
 class VirtualClock:
-    """A clock that moves only when `advance` is called, for tests that do not wait.
+    """A clock that moves only as far as `advance` allows, for tests that do not wait.
 
-    The serving thread sends the data that is due at each step of the clock.
+    The serving thread moves the clock in steps of 20 ms, and sends the data that is due at each
+    step.
     """
 
     def __init__(self) -> None:
@@ -49,19 +52,19 @@ class VirtualClock:
 
     @property
     def is_behind(self) -> bool:
-        """Whether the clock has not reached the time set by `advance` or `advance_to`."""
+        """Whether the clock has not reached the time that `advance` allows."""
         return self._now_ns < self._end_ns
 
     def advance(self, seconds: float) -> None:
-        """Let later calls of `step` move the clock by `seconds` in total."""
+        """Allow the clock to move by another `seconds`; `step` moves the clock."""
         self.advance_to(self._end_ns + int(seconds * SECOND))
 
     def advance_to(self, end_ns: int) -> None:
-        """Let later calls of `step` move the clock until it reaches `end_ns`."""
+        """Allow the clock to move to `end_ns`; `step` moves the clock."""
         self._end_ns = max(self._end_ns, end_ns)
 
     def step(self) -> None:
-        """Move the clock by one step, but not beyond the time set by `advance_to`."""
+        """Move the clock by 20 ms, but at most to the time that `advance` allows."""
         self._now_ns = min(self._now_ns + _VIRTUAL_STEP_NS, self._end_ns)
 
 
@@ -191,7 +194,7 @@ def _send_due(
     if is_unlimited and not outlet.has_listener:
         return
     with _SIMULATION_LOCK.hold(stop) as is_held:
-        chunks = due_chunks(device, now) if is_held else {}
+        chunks = advance_device(device, now) if is_held else {}
     for link, sent in chunks.items():
         outlet.send(link, sent, patient=(is_unlimited or patient) and link == "data")
 
@@ -207,14 +210,17 @@ def _find_wait(device: SimulatedDevice, outlet: Outlet) -> float:
     return min(POLL_S, max(until_deadline, _MIN_PAUSE_S))
 
 
-def due_chunks(
+def advance_device(
     device: SimulatedDevice, now: int, arrival_ns: int | None = None
 ) -> dict[str, list[Chunk]]:
-    """Advance a device to the time `now`; return the chunks that it sends, by link.
+    """Advance a simulated device to the time `now`, and return the chunks that the device sends.
 
     Args:
         now: the device's time, ns.
         arrival_ns: the arrival time of all chunks, ns since 1970; None if unknown.
+
+    Returns:
+        Name of a link in `Sensor.links`, such as "data" -> the chunks sent over the link.
     """
     sensor = device.sensor
     chunks: dict[str, list[Chunk]] = {}
@@ -236,7 +242,7 @@ def _find_endpoint(sensor: Sensor, frame: str) -> Sender:
     return LOCALHOST, ports[0] if is_data else ports[-1]
 
 
-class Served(ClosingContext):
+class ServedSensor(ClosingContext):
     """Runs a simulated sensor at an outlet in a separate thread; a context manager.
 
     Args:
@@ -281,7 +287,9 @@ class Served(ClosingContext):
         self._call_in_thread(lambda: self.device.start(get_now()))
 
     def jump_clock(self, seconds: float) -> None:
-        """Let the sensor's clock jump within a quarter of a second.
+        """Let the sensor's clock jump by `seconds`.
+
+        The jump happens at most a quarter of a second after the call.
 
         Args:
             seconds: size of the jump; negative to jump back.
@@ -333,8 +341,8 @@ class Served(ClosingContext):
     def wait_for_commands(self, names: Sequence[str], *, timeout: float = 10.0) -> None:
         """Wait until the device has received exactly these commands, in this order.
 
-        Use this instead of comparing `device.commands_received`, because the device may read its
-        last command later. Repeated commands count once.
+        Use this method instead of a comparison with `device.commands_received`: when a test
+        compares, the device may not have read the last command yet. Repeated commands count once.
 
         Args:
             names: the names of all commands since the port was opened.

@@ -27,12 +27,14 @@ _MIN_READ_INTERVAL_NS = 2_000_000
 
 
 class SimulatedTransport(LiveTransport):
-    """A link of a simulated device.
+    """One connection to a simulated device, that is one of the links in `Sensor.links`.
 
-    Opening the data link starts the device. Reading the data link advances the time of the device.
+    The link "data" carries the data; another link may carry commands. Opening the link "data"
+    starts the device. Reading the link "data" advances the time of the device.
 
     Args:
-        data: the data link of the same device; None if this is the data link.
+        name: the name of the link.
+        data_link: the transport of the link "data" of the same device; None if this is that link.
 
     Attributes:
         baud: the baud rate of a serial link; None for other links.
@@ -44,7 +46,7 @@ class SimulatedTransport(LiveTransport):
         sensor: Sensor,
         device: SimulatedDevice,
         name: str = "data",
-        data: SimulatedTransport | None = None,
+        data_link: SimulatedTransport | None = None,
     ) -> None:
         self.label = label
         self.sensor = sensor
@@ -62,14 +64,14 @@ class SimulatedTransport(LiveTransport):
         self._changed: threading.Condition
         # link -> bytes that the device has sent and that were not read yet
         self._unread: dict[str, list[bytes]]
-        if data is None:
+        if data_link is None:
             self._changed = threading.Condition()
             self._unread = {}
             device.utc_offset_ns = self._clock.now() - time.monotonic_ns()
             device.start(time.monotonic_ns())
         else:
-            self._changed = data._changed
-            self._unread = data._unread
+            self._changed = data_link._changed
+            self._unread = data_link._unread
         self._unread[name] = []
 
     def link(self, name: str) -> SimulatedTransport:
@@ -129,7 +131,10 @@ class SimulatedTransport(LiveTransport):
         return max(deadline, self._next_read_ns)
 
     def _take(self, now: int) -> list[Chunk]:
-        """Return the unread bytes of this link; advance the device on the data link."""
+        """Return the unread bytes of this link.
+
+        If this is the link "data", advance the device to the time `now` first.
+        """
         if self._name == "data":
             for link, data in self.device.outgoing(now):
                 if link in self._unread:

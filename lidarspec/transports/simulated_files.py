@@ -19,7 +19,7 @@ from lidarspec.recording.recorders import open_recorder
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.transports.protocol import Chunk
-from lidarspec.transports.serving import due_chunks
+from lidarspec.transports.serving import advance_device
 
 #: Minimum and maximum step of the device's time between two writes to the file. With the minimum,
 #: the frames of a fast sensor accumulate, as for a program that reads a port.
@@ -34,7 +34,8 @@ def write_file(
 ) -> int:
     """Write the bytes that a device sends in a period after its start.
 
-    The opening commands are recorded as well. If the device sends no data, no file is created.
+    The commands that lidarspec sends when it opens such a sensor are recorded as well. If the
+    device sends no data, no file is created.
 
     Args:
         path: an .lsr, .pcap, .pcapng or .bin file.
@@ -47,7 +48,7 @@ def write_file(
     Raises:
         UnknownFormat, UsageError: if the file exists, if its format cannot contain the bytes, or if
             nothing is sent.
-        SpecError: if the opening commands do not start the data of the sensor.
+        SpecError: if the commands in `Sensor.on_open` do not start the data of the sensor.
         SourceError: if the file cannot be written.
     """
     transfers = _simulate_opened(device, seconds)
@@ -95,7 +96,7 @@ def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[_Trans
             yield Chunk(data, start_ns + now), "out"
             device.receive(data, now, sensor.commands[name].link)
         now = min(now + _find_step(device, now), end_ns)
-        for chunk in due_chunks(device, now, start_ns + now).get("data", []):
+        for chunk in advance_device(device, now, start_ns + now).get("data", []):
             yield chunk, "in"
 
 
@@ -107,7 +108,10 @@ def _find_step(device: SimulatedDevice, now: int) -> int:
 
 
 def _list_opening_commands(sensor: Sensor) -> list[str]:
-    """Return the opening commands of a sensor that send a frame, by name."""
+    """Return the names of the commands in `on_open` that send a frame.
+
+    The other commands only set control lines.
+    """
     return [name for name in sensor.on_open if sensor.commands[name].frame]
 
 
@@ -117,7 +121,10 @@ def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
     sent = {name: device.sent[name] for name in sensor.main_frames if device.sent[name]}
     if sent:
         frames = ", ".join(f"{number} {name}" for name, number in sent.items())
-        return UsageError(f"nothing was written, because all sent frames ({frames}) were lost")
+        return UsageError(
+            f"nothing was written, because all sent frames ({frames}) were lost in the simulated"
+            " transmission: reduce loss and errors"
+        )
     if device.deadline is not None:
         due = f"the next frame is due after {device.deadline / SECOND:g} s"
         return UsageError(

@@ -186,7 +186,15 @@ class ReceiveSlots:
         return data, sender
 
     def single_control_message(self, index: int) -> tuple[int, int, int] | None:
-        """Return (type, value, value) of a datagram's only control message, or None."""
+        """Return the control message of a datagram that has exactly one, with two integers.
+
+        This method is faster than `control_messages`, and sufficient if the kernel reports only the
+        arrival time of the datagram.
+
+        Returns:
+            (type, first integer, second integer); None if the datagram has no control message,
+            several control messages, or a control message of another size.
+        """
         control_size = self._control_sizes[_CONTROL_SIZE_INDEX + index * _CONTROL_SIZE_STEP]
         if control_size != _CONTROL_WITH_TWO_INTEGERS.size:
             return None
@@ -293,7 +301,7 @@ class UdpTransport(LiveTransport):
         smallest = min(
             (opened.buffer_bytes for opened in self._sockets), default=REQUESTED_BUFFER_BYTES
         )
-        self.warnings = warn_of_small_buffer(REQUESTED_BUFFER_BYTES, smallest)
+        self.warnings = list_buffer_warnings(REQUESTED_BUFFER_BYTES, smallest)
 
     def read(self, timeout: float) -> list[Chunk]:
         sleep_until(self._next_read)
@@ -416,6 +424,10 @@ class UdpTransport(LiveTransport):
 
 class _Socket:
     """A socket and the statistics that the kernel reports for it.
+
+    The kernel reports arrival times by the wall clock. They are converted to the transport's clock
+    (`HostClock`), which starts at the time of the wall clock, but does not change if somebody sets
+    the wall clock.
 
     Attributes:
         buffer_bytes: size of the receive buffer, including the kernel's overhead.
@@ -575,12 +587,12 @@ def _find_command_address(address: SourceAddress, link: Udp) -> tuple[Sender | N
     return None, False
 
 
-def warn_of_small_buffer(requested: int, granted: int) -> list[str]:
-    """Return warnings if a receive buffer is smaller than requested."""
+def list_buffer_warnings(requested: int, granted: int) -> list[str]:
+    """Return a list with a warning if a receive buffer is smaller than requested, else []."""
     if granted >= requested:
         return []
     text = describe_small_buffer(requested, granted)
-    return [f"{text}; next: {enlarge_buffer_command(requested)}"]
+    return [f"{text}; next: {make_sysctl_command(requested)}"]
 
 
 def describe_small_buffer(requested: int, granted: int) -> str:
@@ -591,7 +603,7 @@ def describe_small_buffer(requested: int, granted: int) -> str:
     )
 
 
-def enlarge_buffer_command(requested: int) -> str:
+def make_sysctl_command(requested: int) -> str:
     """Return the command that allows programs to request a buffer of `requested` bytes."""
     return f"sudo sysctl -w net.core.rmem_max={requested}"
 

@@ -137,7 +137,7 @@ def list_usb_devices(platform: str = sys.platform) -> list[UsbDevice]:
         return list(parse_ioreg(listed, list_usb_ids()))
     if platform == "win32":
         listed = _read_output("powershell", "-NoProfile", "-Command", _WINDOWS_QUERY)
-        return list(parse_windows(listed))
+        return list(parse_pnp_json(listed))
     return []
 
 
@@ -174,8 +174,12 @@ def parse_ioreg(listed: bytes, ids_of_ports: Iterable[tuple[int, int]]) -> Itera
                 yield UsbDevice(ids[0], ids[1], ids in with_port)
 
 
-def parse_windows(listed: bytes) -> Iterator[UsbDevice]:
-    """Yield the USB devices in the JSON output of Windows, which may be empty."""
+def parse_pnp_json(listed: bytes) -> Iterator[UsbDevice]:
+    """Yield the USB devices in the JSON output of `_WINDOWS_QUERY`.
+
+    Args:
+        listed: a JSON object, or a list of objects; empty if PowerShell failed or found no device.
+    """
     if not listed.strip():
         return
     entries: Any = json.loads(listed)

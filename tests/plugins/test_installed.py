@@ -24,7 +24,7 @@ from lidarspec.entry_points import EntryPoint, entry_points
 from lidarspec.errors import UnknownSensor
 from lidarspec.plugins import HookedPoints, Registry, named_owners, try_plugins
 from lidarspec.spec import hookimpl
-from lidarspec.trusted_files import own_settings
+from lidarspec.trusted_files import user_settings_path
 from tests.shapes import SHAPES
 
 
@@ -391,7 +391,7 @@ def test_owners_that_cannot_be_read_are_warned_of(
 ) -> None:
     for name in ("XDG_CONFIG_HOME", "APPDATA"):
         monkeypatch.setenv(name, str(tmp_path))
-    (file := own_settings()).parent.mkdir()
+    (file := user_settings_path()).parent.mkdir()
     file.write_text(text, encoding="utf-8")
     with pytest.warns(UserWarning, match=rf"{file}: .*; all \[owners\] in this file are ignored"):
         assert named_owners() == {}

@@ -24,7 +24,7 @@ from lidarspec.transports import outlets
 from lidarspec.transports.destinations import make_replay_outlet
 from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.outlets import Outlet, PtyLine, TcpLine, UdpLine
-from lidarspec.transports.replays import Deadlines, Replay, iter_paced
+from lidarspec.transports.replays import Deadlines, Replay, iter_at_deadlines
 from tests.lines import TIMEOUT_S, until, working
 
 STREAM, DATAGRAMS = "ldrobot-stl27l", "velodyne-vlp16"
@@ -80,7 +80,7 @@ def playing(
             if began is not None:
                 began.append(time.monotonic())
             with contextlib.closing(open_transport(path)) as source:
-                for chunk, _ in iter_paced(source.chunks(), speed=speed):
+                for chunk, _ in iter_at_deadlines(source.chunks(), speed=speed):
                     target.deliver(chunk)
         except BaseException as error:
             failed.append(error)
@@ -229,7 +229,7 @@ def test_oversleeping_does_not_add_up(speed: float) -> None:
     clock = Clock()
     chunks = [Chunk(b"x", 10**18 + number * MS) for number in range(10_000)]
     times, late = [], []
-    for _, late_ns in iter_paced(chunks, speed=speed, now=clock.now, sleep=clock.sleep):
+    for _, late_ns in iter_at_deadlines(chunks, speed=speed, now=clock.now, sleep=clock.sleep):
         times.append(clock.now())
         late.append(late_ns)
     due = [round(number * MS / speed) for number in range(10_000)]
@@ -241,7 +241,7 @@ def test_oversleeping_does_not_add_up(speed: float) -> None:
 def test_as_fast_as_possible_never_waits() -> None:
     clock = Clock()
     chunks = [Chunk(b"", SECOND * number) for number in range(9)]
-    sent = list(iter_paced(chunks, speed=None, now=clock.now, sleep=clock.sleep))
+    sent = list(iter_at_deadlines(chunks, speed=None, now=clock.now, sleep=clock.sleep))
     assert sent == [(chunk, 0) for chunk in chunks]
     assert clock.now() == 5 * SECOND
 

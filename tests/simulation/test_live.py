@@ -28,7 +28,7 @@ from lidarspec.simulation.scenes import Room, read_scene
 from lidarspec.spec import Command, Frame, OnChange, Polar, Scaled, Serial, Simulation, Udp
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports.destinations import make_simulated_outlet
-from lidarspec.transports.serving import FairLock, Served
+from lidarspec.transports.serving import FairLock, ServedSensor
 from lidarspec.transports.simulated_files import write_file
 from lidarspec.view.terminal_screen import Keyboard
 from tests.broken import sound
@@ -405,7 +405,7 @@ def test_an_exception_of_the_serving_thread_is_raised_at_the_end() -> None:
             tried.set()
             raise ZeroDivisionError
 
-    port = Served(Broken(stl(), faults=Faults()), make_simulated_outlet(stl(), "pty"))
+    port = ServedSensor(Broken(stl(), faults=Faults()), make_simulated_outlet(stl(), "pty"))
     assert tried.wait(TIMEOUT_S)
     with pytest.raises(ZeroDivisionError):
         port.close()
@@ -452,7 +452,9 @@ def test_keys_come_over_any_descriptor() -> None:
 @posix
 def test_many_simulators_take_turns_and_end() -> None:
     """One process runs twelve simulators; all of them send, and all of them end."""
-    ports = [Served(SimulatedDevice(stl()), make_simulated_outlet(stl(), "pty")) for _ in range(12)]
+    ports = [
+        ServedSensor(SimulatedDevice(stl()), make_simulated_outlet(stl(), "pty")) for _ in range(12)
+    ]
     until(lambda: all(port.device.sent["data"] for port in ports))
 
     def end() -> None:

@@ -36,7 +36,7 @@ PLACES = [
 @contextlib.contextmanager
 def open_simulated(
     sensor: ls.Sensor, to: str, **settings: Any
-) -> Iterator[tuple[serving.Served, ls.Device]]:
+) -> Iterator[tuple[serving.ServedSensor, ls.Device]]:
     """Yield a simulated sensor in virtual time, and a device that reads its port."""
     if to == "udp":
         to = f"udp://127.0.0.1:{free_port()}"

@@ -15,13 +15,13 @@ from lidarspec.transports.addresses import parse_origin
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.outlets import UdpLine
-from lidarspec.transports.protocol import Origin, endpoint
+from lidarspec.transports.protocol import Origin, format_sender
 from lidarspec.transports.udp import (
     REQUESTED_BUFFER_BYTES,
     UdpTransport,
     _order_times,
     _Socket,
-    warn_of_small_buffer,
+    list_buffer_warnings,
 )
 from tests.lines import free_port, udp, until
 from tests.shapes import SHAPES
@@ -93,7 +93,7 @@ def test_a_sender_is_an_address_or_a_port_of_it(text: str, origin: Origin) -> No
     assert Origin.parse(text) == origin
     assert (origin.host, 2368) in origin
     assert ((origin.host, 2369) in origin) == (origin.port is None)
-    assert Origin.parse(endpoint((origin.host, 7))) == Origin(origin.host, 7)
+    assert Origin.parse(format_sender((origin.host, 7))) == Origin(origin.host, 7)
 
 
 @pytest.mark.parametrize("name", ["localhost", "0:0:0:0:0:0:0:1", "[::1]:2368"])
@@ -248,8 +248,8 @@ def test_a_multicast_group_is_joined() -> None:
 
 
 def test_a_small_buffer_is_a_warning_with_a_command() -> None:
-    assert warn_of_small_buffer(REQUESTED_BUFFER_BYTES, REQUESTED_BUFFER_BYTES) == []
-    (text,) = warn_of_small_buffer(8 << 20, 212_992)
+    assert list_buffer_warnings(REQUESTED_BUFFER_BYTES, REQUESTED_BUFFER_BYTES) == []
+    (text,) = list_buffer_warnings(8 << 20, 212_992)
     assert text.endswith("next: sudo sysctl -w net.core.rmem_max=8388608")
     assert "208 KiB instead of 8192" in text
 

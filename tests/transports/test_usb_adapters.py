@@ -19,7 +19,7 @@ from lidarspec.transports.usb_adapters import (
     UsbDevice,
     describe_missing_driver,
     parse_ioreg,
-    parse_windows,
+    parse_pnp_json,
     read_sysfs,
 )
 
@@ -85,10 +85,10 @@ def test_windows_reports_an_error_code_without_a_driver(is_list: bool) -> None:
     working = {"DeviceID": r"USB\VID_0403&PID_6001\A5", "ConfigManagerErrorCode": 0}
     hub = {"DeviceID": r"USB\ROOT_HUB30\4", "ConfigManagerErrorCode": 0}
     listed = [missing, working, hub] if is_list else missing
-    devices = list(parse_windows(json.dumps(listed).encode()))
+    devices = list(parse_pnp_json(json.dumps(listed).encode()))
     expected = [UsbDevice(*CP2102, False), UsbDevice(*FT232R, True)]
     assert devices == (expected if is_list else expected[:1])
-    assert list(parse_windows(b"\r\n")) == []
+    assert list(parse_pnp_json(b"\r\n")) == []
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)

@@ -18,7 +18,7 @@ from std_msgs.msg import UInt8MultiArray
 
 from lidarspec.errors import SourceError
 from lidarspec.transports.protocol import Chunk, LiveTransport
-from lidarspec.transports.robotics_logs import raw_chunk
+from lidarspec.transports.robotics_logs import read_chunk
 
 MAX_WAITING_PACKETS = 5000  # some seconds of the fastest sensors
 _NODE_NUMBERS = itertools.count()
@@ -69,7 +69,7 @@ class PacketTransport(LiveTransport):
         self._executor.add_node(self._node)
         qos = QoSProfile(depth=MAX_WAITING_PACKETS, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._node.create_subscription(
-            UInt8MultiArray, topic, lambda message: self._chunks.append(raw_chunk(message)), qos
+            UInt8MultiArray, topic, lambda message: self._chunks.append(read_chunk(message)), qos
         )
 
     def read(self, timeout: float) -> list[Chunk]:

@@ -14,7 +14,7 @@ from std_msgs.msg import UInt8MultiArray
 
 import lidarspec as ls
 from lidarspec.formats.messages import SCAN
-from lidarspec.transports.robotics_logs import RAW, raw_chunk
+from lidarspec.transports.robotics_logs import RAW, read_chunk
 
 
 def test_a_node_decodes_packets_of_another_node(run: Any, client: Client) -> None:
@@ -52,7 +52,7 @@ def test_a_bag_with_packets_is_a_source(
     packets = client.listen("packets", UInt8MultiArray)
     run(f"sim:{sensor}", "-s", sensor, ros=format_parameters(publish_packets=True, qos="reliable"))
     client.until(lambda: len(packets) > 500)
-    chunks = [raw_chunk(message(data, RAW)) for data in packets]
+    chunks = [read_chunk(message(data, RAW)) for data in packets]
     with Writer(tmp_path / "bag", version=8) as bag:
         connection = bag.add_connection("/lidar/packets", RAW, typestore=STORE)
         for data, chunk in zip(packets, chunks, strict=True):

@@ -24,7 +24,7 @@ from lidarspec.packets.imu import ImuSamples
 from lidarspec.recording.recorders import Recorder
 from lidarspec.scans.beams import PlanarScans
 from lidarspec.transports.protocol import Chunk
-from lidarspec.transports.robotics_logs import RAW, raw_chunk
+from lidarspec.transports.robotics_logs import RAW, read_chunk
 
 MESSAGES = RosMessages("ROS2_HUMBLE")
 WHOLE, STAMP = 6, 1_700_000_000_123_456_789
@@ -39,7 +39,7 @@ def record(packets: list[bytes], path: Path, sensor: str) -> Path:
     """Write the messages of the topic of packets to a recording; return its path."""
     with Recorder(path, sensor) as recorder:
         for packet in packets:
-            recorder.write(raw_chunk(message(packet, RAW)))
+            recorder.write(read_chunk(message(packet, RAW)))
     return path
 
 

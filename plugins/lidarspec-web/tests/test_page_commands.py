@@ -11,7 +11,7 @@ import lidarspec as ls
 from lidarspec.explaining.assignments import parse_arguments
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.transports.destinations import make_simulated_outlet
-from lidarspec.transports.serving import Served
+from lidarspec.transports.serving import ServedSensor
 from tests.installed import sensor_modules, sensors_in
 
 from .pages import FLAT, Page, Station, write_recording
@@ -100,7 +100,7 @@ def test_a_command_without_an_answer_is_sent(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_real_device_takes_commands_only_with_control(tmp_path: Path) -> None:
     sensor = ls.sensor(ANSWERING)
-    with Served(
+    with ServedSensor(
         SimulatedDevice(sensor), make_simulated_outlet(sensor, "tcp://127.0.0.1:0"), patient=True
     ) as served:
         with Station(served.path, tmp_path, ANSWERING) as station, station.page() as page:
