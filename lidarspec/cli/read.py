@@ -41,7 +41,7 @@ from lidarspec.scans.selection import PacketTimes, Selection, TimeSlice
 from lidarspec.sensor_operations import Sensor
 from lidarspec.view.live_frames import LiveFrames, open_live
 from lidarspec.view.live_scans import LOOK_S, LiveScans
-from lidarspec.view.rate_meter import MeterReading, format_figure
+from lidarspec.view.rate_meter import MeterReading, format_number
 
 #: Column of points -> (width in characters, number of decimals).
 POINT_FORMATS = {
@@ -262,16 +262,16 @@ def _to_json(value: Any) -> Any:
 #: (name, unit, width of the column, function that formats it) of each measured value. A value with
 #: the width 0 is printed only in the summary.
 FIGURES: tuple[tuple[str, str, int, Callable[[MeterReading], str]], ...] = (
-    ("speed", "Hz", 6, lambda r: format_figure(r.speed_hz, "{:.2f}")),
-    ("packets", "/s", 8, lambda r: format_figure(r.packet_rate_hz, "{:.1f}")),
-    ("points", "/scan", 7, lambda r: format_figure(r.points, "{:.0f}")),
-    ("valid", "/scan", 7, lambda r: format_figure(r.valid, "{:.0f}")),
-    ("errors", "%", 7, lambda r: format_figure(r.error_rate, "{:.3f}", 100)),
-    ("skipped", "%", 7, lambda r: format_figure(r.skipped_rate, "{:.3f}", 100)),
-    ("loss", "%", 7, lambda r: format_figure(r.loss_rate, "{:.3f}", 100)),
-    ("jitter", "ms", 8, lambda r: format_figure(r.jitter_s, "{:.3f}", 1e3)),
-    ("gap", "ms", 0, lambda r: format_figure(r.longest_gap_s, "{:.2f}", 1e3)),
-    ("input", "kB/s", 0, lambda r: format_figure(r.bytes_per_s, "{:.1f}", 1e-3)),
+    ("speed", "Hz", 6, lambda r: format_number(r.speed_hz, "{:.2f}")),
+    ("packets", "/s", 8, lambda r: format_number(r.packet_rate_hz, "{:.1f}")),
+    ("points", "/scan", 7, lambda r: format_number(r.points, "{:.0f}")),
+    ("valid", "/scan", 7, lambda r: format_number(r.valid, "{:.0f}")),
+    ("errors", "%", 7, lambda r: format_number(r.error_rate, "{:.3f}", 100)),
+    ("skipped", "%", 7, lambda r: format_number(r.skipped_rate, "{:.3f}", 100)),
+    ("loss", "%", 7, lambda r: format_number(r.loss_rate, "{:.3f}", 100)),
+    ("jitter", "ms", 8, lambda r: format_number(r.jitter_s, "{:.3f}", 1e3)),
+    ("gap", "ms", 0, lambda r: format_number(r.longest_gap_s, "{:.2f}", 1e3)),
+    ("input", "kB/s", 0, lambda r: format_number(r.bytes_per_s, "{:.1f}", 1e-3)),
 )
 COLUMNS = [figure for figure in FIGURES if figure[2]]
 #: Widths of the columns of `stats`: the time, the measured values, and the queue.
@@ -298,7 +298,7 @@ class StatsPrinter:
         figures = [text(reading) for _, _, _, text in COLUMNS]
         say(
             _format_row(
-                [format_figure(at, "{:.1f}"), *figures, format_figure(self.device.queued, "{}")],
+                [format_number(at, "{:.1f}"), *figures, format_number(self.device.queued, "{}")],
                 WIDTHS,
             )
         )
@@ -461,7 +461,7 @@ def _print_by_clock(
         patience.check()
         now = time.monotonic()
         lines.print_interval(
-            round(now - start, 3), feed.meter.reading(feed.device.stats, now - last)
+            round(now - start, 3), feed.meter.take_reading(feed.device.stats, now - last)
         )
         last = now
 
@@ -482,4 +482,4 @@ def _print_by_packet_time(
         passed = (int(times[-1]) - start) * 1e-9
         if passed >= (edges + 1) * interval:
             edges = int(passed / interval)
-            lines.print_interval(round(passed, 3), feed.meter.reading(feed.device.stats))
+            lines.print_interval(round(passed, 3), feed.meter.take_reading(feed.device.stats))

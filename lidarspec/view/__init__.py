@@ -6,9 +6,9 @@ distribution `lidarspec-web`. Modules in reading order:
 * `terminal_window`: a window in the terminal that shows a running sensor and reads keys.
 * `terminal_window_parts`: the title, statistics, colours and keys around the picture.
 * `live_scans`: reads, counts and plays the scans of a device.
-* `live_frames`: reads and counts the frames of a device without points.
+* `live_frames`: reads and counts the frames of a device that measures no points, such as an IMU.
 * `rate_meter`: measures speed, rates, losses and jitter of a running sensor.
-* `polar`: draws points from above and from the side.
+* `polar`: draws points in character cells, from above and from the side.
 * `canvas`: pictures made of characters, and their colours.
 * `terminal_screen`: writes changed cells to the terminal, and reads single keys.
 * `svg`: draws a scan as SVG.

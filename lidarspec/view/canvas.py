@@ -201,7 +201,7 @@ class Canvas:
     Attributes:
         width: number of columns of cells.
         height: number of rows of cells.
-        ramp: the column that the colours show.
+        ramp: the column of the points that determines their colours, such as "range".
         dots: the dots of points, (4 * height, 2 * width) bool.
         lines: the dots of rings and axes, (4 * height, 2 * width) bool.
         steps: the colour of each cell's points, as a step of the colour ramp, (height, width)
@@ -222,7 +222,7 @@ class Canvas:
 
         Args:
             column, row: fractional coordinates in dots, (n,).
-            shade: positions on the ramp, from 0 to 1, (n,).
+            shade: positions on the colour ramp, from 0 (first colour) to 1 (last colour), (n,).
         """
         across, down, inside = self._to_dots(column, row)
         self.dots[down, across] = True

@@ -1,4 +1,4 @@
-"""Read and count the frames of an open device without points."""
+"""Read and count the frames of an open device that measures no points, such as an IMU."""
 
 from __future__ import annotations
 
@@ -17,10 +17,13 @@ from lidarspec.view.rate_meter import RateMeter
 
 
 def open_live(device: Device, select: Selection = EVERYTHING) -> LiveScans | LiveFrames:
-    """Return the scans of an open device, or the frames of a device without points.
+    """Return the reader of an open device.
+
+    Returns:
+        `LiveScans` if the device measures points, otherwise `LiveFrames`.
 
     Raises:
-        UsageError: if `select` selects scans, but the sensor has no points.
+        UsageError: if `select` selects scans, but the device measures no points.
     """
     if device.sensor.has_points:
         return LiveScans(device, select=select)

@@ -38,19 +38,22 @@ Times = NDArray[np.int64]
 class LiveScans:
     """Reads, counts and plays the scans of an open device.
 
+    To show a scan, this class counts it, adds it to `scans` and updates `scan`. The caller draws
+    the scan.
+
     Args:
         device: the open device; it is not closed.
-        played: whether scans of a file are shown at the recorded speed, instead of as fast as
-            possible.
-        speed: the speed of a played file, relative to the recorded speed.
+        played: whether scans of a file are shown at their recorded times, scaled by `speed`,
+            instead of as fast as possible.
+        speed: the first value of the attribute `speed`.
         select: the scans to show; None for all.
         ahead: approximate number of seconds of a played file to read at a time; None to read as
             fast as possible.
 
     Attributes:
-        speed: the speed of a played file; it may be changed.
+        speed: how fast a file is played; 2.0 is twice as fast as recorded. It may be changed.
         packets: the batch that was read last; None if nothing arrived.
-        scans: the complete and incomplete scans of the last `read` or `step`.
+        scans: the complete and incomplete scans that the last `read` or `step` has shown.
         scan: the newest complete scan; before the first complete scan, an incomplete scan or None.
         number: number of times that `scan` has changed.
 
@@ -112,7 +115,7 @@ class LiveScans:
         return self.packets.time_ns
 
     def read(self, until: float) -> None:
-        """Read data and show scans until a time or the end of the input.
+        """Read data, and show the scans that are due, until a time or the end of the input.
 
         Args:
             until: a time of `time.monotonic`.
@@ -131,7 +134,9 @@ class LiveScans:
                 return
 
     def step(self) -> None:
-        """Show the next scan of a played file now; do nothing at the end of the file.
+        """Show the next scan of a played file without waiting until it is due.
+
+        At the end of the file, no scan is shown.
 
         Raises:
             LidarSpecError: if the source fails.
@@ -221,7 +226,7 @@ class LiveScans:
         return packets.take(is_selected)
 
     def _store_scans(self, scans: list[Scan]) -> None:
-        """Show the selected scans, or store them until they are due."""
+        """Show the selected scans; if a file is played, store them until they are due."""
         for scan in scans:
             if self._sieve.ended:
                 return

@@ -79,7 +79,11 @@ def save(figure: Any, target: Any, suffix: str) -> None:
 
 @_with_style
 def draw_scan(scan: Scan, look: CloudAppearance, title: str) -> Any:
-    """Return a figure of a scan, seen from above with forward up."""
+    """Return a figure of a scan, seen from above and, if it is not flat, from the right side.
+
+    Args:
+        look: the extent of the view and the colours of the points, from `choose_appearance`.
+    """
     cloud = scan.points[scan.points.valid]
     column: Any
     if look.ramp == "range":
@@ -316,7 +320,9 @@ class RateSeries:
         self.totals = grown + np.outer((1, lost / len(packets), wrong / len(packets)), counted)
 
     def series(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the totals of at most `MAX_TIME_BINS` time steps.
+        """Return the totals of each time step.
+
+        Consecutive steps are combined until there are at most `MAX_TIME_BINS` steps.
 
         Returns:
             The edges of the steps, (n + 1,) seconds, and the numbers of packets, lost packets and

@@ -75,7 +75,7 @@ def packets(value: Packets) -> str:
     more = f"; {len(fields) - len(shown)} further fields" * (len(fields) > len(shown))
     if len(value):
         moment = np.datetime64(int(value.time_ns[0]), "ns")
-        first = f"; first packet: {moment}, by the {_name_clock(value)} clock"
+        first = f"; time of the first packet: {moment} ({_name_clock(value)} clock)"
     else:
         first = ""
     return _make_table(

@@ -40,10 +40,10 @@ class PageServer(AbstractContextManager["PageServer"], Protocol):
         """The reason why the last recording could not be written; "" if it was written."""
 
     def opening_page(self) -> str:
-        """Write a file that redirects to `link`, and return the URL of the file.
+        """Write a local HTML file that redirects to `link`, and return the URL of the file.
 
-        Start a browser with this URL. `link` contains a token, and other users can see the command
-        line of a browser.
+        Start a browser with this URL instead of `link`, because `link` contains a token, and other
+        users can see the command line of a browser.
 
         Raises:
             OSError: if the file cannot be written.

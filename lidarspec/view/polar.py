@@ -1,6 +1,7 @@
-"""Draw clouds in character cells, seen from above, with range rings.
+"""Draw clouds in character cells.
 
-The forward direction is up. 3D clouds are also drawn from the right side.
+A cloud is drawn from above, with range rings; the front of the sensor is at the top of the picture.
+A 3D cloud is also drawn from its right side; the front is then at the right of the picture.
 """
 
 from __future__ import annotations
@@ -25,7 +26,13 @@ MAX_FILLED_SHARE = 0.9
 
 
 def draw_cloud(points: PointCloud, *, width: int, height: int, look: CloudAppearance) -> CellGrid:
-    """Draw a cloud from above, in `width` by `height` cells."""
+    """Draw a cloud from above and, if it is not flat, from the right side.
+
+    Args:
+        width: number of columns of cells.
+        height: number of rows of cells.
+        look: the extent of the view and the colours of the points, from `choose_appearance`.
+    """
     cloud = points[points.valid]
     if look.flat:
         return _draw_from_above(cloud, width, height, look)
@@ -35,9 +42,7 @@ def draw_cloud(points: PointCloud, *, width: int, height: int, look: CloudAppear
     side, scale = _draw_from_side(
         cloud, width, max(height - 1 - above, 1), look, _find_scale(width, above, look.reach)
     )
-    title = "─ seen from the right, forward is right" + (
-        f", heights x{scale} " if scale > 1 else " "
-    )
+    title = "─ side view, front at the right" + (f", heights x{scale} " if scale > 1 else " ")
     whole.write(above, 0, title.ljust(width, "─"), FAINT)
     whole.write(above, 2, title[2:].rstrip("─ "), LABEL)
     whole.paste(above + 1, 0, side)

@@ -34,7 +34,7 @@ class MeterReading:
         packets: number of packets.
         packet_rate_hz: packets per second.
         points: mean number of points per scan.
-        valid: mean number of points with a return per scan.
+        valid: mean number, per scan, of points with a return.
         error_rate: the share of frames with a wrong checksum, length or value, from 0 to 1.
         skipped_rate: the share of bytes that are not in frames and are not fillers, from 0 to 1.
         loss_rate: the share of lost packets, from 0 to 1; None if losses are not counted.
@@ -123,7 +123,7 @@ class RateTally:
         if rate_hz > 0 and np.isfinite(rate_hz):
             self._periods.append(1 / rate_hz)
 
-    def reading(
+    def make_reading(
         self, counters: Counters, *, seconds: float | None, counts_losses: bool
     ) -> MeterReading:
         """Return the statistics since the tally was made.
@@ -234,15 +234,17 @@ class RateMeter:
         for tally in (self._recent, self._all):
             tally.add_scan(len(scan), valid, scan.rate_hz)
 
-    def reading(self, counters: Counters, seconds: float | None = None) -> MeterReading:
-        """Return the statistics since the last call, and start a new period."""
-        reading = self._recent.reading(counters, seconds=seconds, counts_losses=self._counts_losses)
+    def take_reading(self, counters: Counters, seconds: float | None = None) -> MeterReading:
+        """Return the statistics since the last call of this method, and start a new period."""
+        reading = self._recent.make_reading(
+            counters, seconds=seconds, counts_losses=self._counts_losses
+        )
         self._recent = RateTally(counters)
         return reading
 
     def summary(self, counters: Counters, seconds: float | None = None) -> MeterReading:
         """Return the statistics since the meter was made."""
-        return self._all.reading(counters, seconds=seconds, counts_losses=self._counts_losses)
+        return self._all.make_reading(counters, seconds=seconds, counts_losses=self._counts_losses)
 
 
 def totals(counters: Counters) -> dict[str, int]:
@@ -259,7 +261,7 @@ def totals(counters: Counters) -> dict[str, int]:
     }
 
 
-def format_figure(value: float | None, form: str, factor: float = 1) -> str:
+def format_number(value: float | None, form: str, factor: float = 1) -> str:
     """Return a number as text; "-" if it is unknown.
 
     Args:

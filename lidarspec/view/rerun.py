@@ -12,7 +12,7 @@ from lidarspec.view.live_scans import LOOK_S, LiveScans
 
 #: time between two readings of the statistics, by the stamps of the scans.
 STATISTICS_PERIOD_S = 1.0
-#: attributes of `MeterReading` to log. Statistics of a scan are logged with the scan.
+#: attributes of `MeterReading` to send. Statistics of a scan are sent with the scan.
 STATISTICS = (
     "packet_rate_hz",
     "error_rate",
@@ -26,12 +26,14 @@ SCHEMES = ("rerun://", "rerun+http://", "rerun+https://")
 
 
 def show(live: LiveScans, target: str, *, ramp: str = "range", until: float) -> None:
-    """Log scans and statistics when they arrive.
+    """Send scans and statistics to a Rerun viewer or file as soon as they arrive.
+
+    Returns at the end of the input, or at the time `until`.
 
     Args:
         live: the scans of the open device.
         target: a file to write, the URL of a running viewer, or "" to open a viewer.
-        ramp: the column that the colours show.
+        ramp: the column of the points that determines their colours.
         until: a time of `time.monotonic` at which to return.
 
     Raises:
@@ -49,7 +51,7 @@ def show(live: LiveScans, target: str, *, ramp: str = "range", until: float) -> 
                 if last is None or not 0 <= scan.stamp_ns - last < STATISTICS_PERIOD_S * 1e9:
                     now = time.monotonic()
                     is_live = live.device.is_live
-                    reading = live.meter.reading(
+                    reading = live.meter.take_reading(
                         live.device.stats, now - read_at if is_live else None
                     )
                     log.log_statistics({name: getattr(reading, name) for name in STATISTICS})

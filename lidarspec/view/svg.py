@@ -51,11 +51,13 @@ def svg(
     side: int = SIDE_PX,
     most: int | None = None,
 ) -> str:
-    """Return a cloud as an SVG document, from above and from its right side.
+    """Return a cloud as an SVG document.
+
+    The cloud is drawn from above and, if it is not flat, from the right side.
 
     Args:
-        look: the appearance; a flat cloud is drawn only from above.
-        side: side of the view from above, in pixels.
+        look: the extent of the view and the colours of the points, from `choose_appearance`.
+        side: width and height of the view from above, in pixels.
         most: maximum number of dots in a view; None for no limit.
     """
     cloud = points[points.valid]
@@ -130,7 +132,7 @@ class _ViewDrawer:
         return self.side / 2 / self.look.reach
 
     def draw_from_above(self) -> _View:
-        """Draw range rings, axes, points and the sensor, seen from above; forward is up."""
+        """Draw range rings, axes, points and the sensor from above, with the front at the top."""
         scale = self._scale
         side = self.side
         forward, left = self.look.middle
@@ -175,10 +177,10 @@ class _ViewDrawer:
             f"<g {_style_of('text')}>{''.join(labels.parts)}</g>",
             f'<path d="M{across:.1f} {down - 9:.1f}l6 15h-12z" {_style_of("head")}/>',
         ]
-        return _View("seen from above, forward is up", parts, top, bottom - top, dots)
+        return _View("top view, front at the top", parts, top, bottom - top, dots)
 
     def draw_from_side(self) -> _View:
-        """Draw height lines, points and the sensor, seen from the side; forward is right."""
+        """Draw height lines, points and the sensor from its right, with the front at the right."""
         scale = self._scale
         side = self.side
         lowest, highest = find_bounds(self.cloud)
@@ -202,9 +204,7 @@ class _ViewDrawer:
         labels = _Labels(side, 0, height)
         for mark in marks:
             labels.write(f"z {mark:.4g} m", [(2, level - mark * steep - 3)])
-        title = (
-            f"seen from the right, forward is right{f', heights x{larger}' if larger > 1 else ''}"
-        )
+        title = f"side view, front at the right{f', heights x{larger}' if larger > 1 else ''}"
         dots, paths = self._draw_dots(
             across + self.cloud.x * scale, level - self.cloud.z * steep, height
         )

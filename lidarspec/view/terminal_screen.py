@@ -51,9 +51,9 @@ MAX_BRIDGED_CELLS = 4
 
 
 class KeyReader:
-    """Reads keys; a context manager that restores the terminal.
+    """Reads keys; a context manager that restores the settings of the terminal on exit.
 
-    This base class is used if there is no keyboard.
+    This base class is used if there is no keyboard: `read` only waits and returns no key.
     """
 
     def read(self, timeout: float) -> list[str]:

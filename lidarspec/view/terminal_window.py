@@ -13,7 +13,7 @@ from lidarspec.scans.scan import Scan
 from lidarspec.view.canvas import ALARM, GOOD, PLAIN, STRONG, CellGrid
 from lidarspec.view.live_scans import LiveScans
 from lidarspec.view.polar import draw_cloud
-from lidarspec.view.rate_meter import EMPTY_READING, MeterReading, format_figure
+from lidarspec.view.rate_meter import EMPTY_READING, MeterReading, format_number
 from lidarspec.view.terminal_screen import Screen
 from lidarspec.view.terminal_window_parts import (
     WindowFigure,
@@ -54,7 +54,7 @@ class ViewSettings:
     """The settings that keys change.
 
     Attributes:
-        ramp: the column that the colours show.
+        ramp: the column of the points that determines their colours.
         zoom: magnification; 1.0 shows all points.
         middle: the middle of the picture, in metres forward and left of the sensor.
         shows_keys: whether the list of keys is shown.
@@ -75,7 +75,7 @@ class ViewSettings:
 
         Args:
             reach: distance from the middle of the picture to its edge, in metres.
-            ramps: the columns that the colours can show.
+            ramps: the columns of the points that can determine their colours.
         """
         if key in ("q", "Q"):
             return replace(self, is_closing=True)
@@ -112,7 +112,7 @@ class Window:
     Args:
         live: the scans of the open device.
         source: the SOURCE as typed by the user.
-        ramp: the column that the colours show at first.
+        ramp: the column of the points that determines their colours until a key changes it.
         record: switches the recording of a live source on and off; None for a file.
         duration: seconds after which the window closes; None if only a key closes it.
     """
@@ -172,7 +172,7 @@ class Window:
         return screen.keys.read(0)
 
     def cells(self, columns: int, lines: int) -> CellGrid:
-        """Draw the window, with the statistics at the right or in the last line."""
+        """Return a picture of the window, with the statistics at the right or in the last line."""
         self._update_reading()
         self._update_scan()
         is_wide = columns > MIN_PICTURE_COLUMNS + SIDE_COLUMNS and lines >= MIN_SIDE_LINES
@@ -214,7 +214,7 @@ class Window:
         if duration < FIGURES_PERIOD_S:
             return
         seconds = duration if self._device.is_live else None
-        self._reading = self._live.meter.reading(self._device.stats, seconds)
+        self._reading = self._live.meter.take_reading(self._device.stats, seconds)
         self._read_at = now
 
     def _update_scan(self) -> None:
@@ -267,14 +267,14 @@ class Window:
         """Return the statistics of the last second and of the shown scan."""
         reading = self._reading or EMPTY_READING
         figures = [
-            WindowFigure("speed", format_figure(reading.speed_hz, "{:.1f} Hz"), STRONG),
-            WindowFigure("packets", format_figure(reading.packet_rate_hz, "{:.0f} /s")),
-            WindowFigure("input", format_figure(reading.bytes_per_s, "{:.1f} kB/s", 1e-3)),
+            WindowFigure("speed", format_number(reading.speed_hz, "{:.1f} Hz"), STRONG),
+            WindowFigure("packets", format_number(reading.packet_rate_hz, "{:.0f} /s")),
+            WindowFigure("input", format_number(reading.bytes_per_s, "{:.1f} kB/s", 1e-3)),
             *self._list_scan_figures(),
             _make_rate_figure("errors", reading.error_rate if self._reading else None),
             _make_rate_figure("skipped", reading.skipped_rate if self._reading else None),
             self._make_lost_figure(reading),
-            WindowFigure("jitter", format_figure(reading.jitter_s, "{:.2f} ms", 1e3)),
+            WindowFigure("jitter", format_number(reading.jitter_s, "{:.2f} ms", 1e3)),
         ]
         if self._device.queued is not None:
             figures.append(WindowFigure("queue", str(self._device.queued)))
@@ -297,8 +297,8 @@ class Window:
         nearest = float(ranges.min()) if len(ranges) else None
         figures = [
             WindowFigure("points", str(len(points))),
-            WindowFigure("valid", format_figure(valid_share, "{:.1f} %", 100)),
-            WindowFigure("nearest", format_figure(nearest, "{:.2f} m")),
+            WindowFigure("valid", format_number(valid_share, "{:.1f} %", 100)),
+            WindowFigure("nearest", format_number(nearest, "{:.2f} m")),
         ]
         if points.nominal:
             figures.insert(0, WindowFigure("calibration", "nominal", ALARM))
@@ -333,7 +333,7 @@ class Window:
 
 def _make_rate_figure(name: str, rate: float | None) -> WindowFigure:
     is_alarm = rate is not None and rate >= ALARM_RATE
-    return WindowFigure(name, format_figure(rate, "{:.2f} %", 100), ALARM if is_alarm else PLAIN)
+    return WindowFigure(name, format_number(rate, "{:.2f} %", 100), ALARM if is_alarm else PLAIN)
 
 
 def _paste_in_middle(target: CellGrid, box: CellGrid) -> None:

@@ -46,7 +46,9 @@ def write_title(window: CellGrid, sensor: str, source: str, state: str, ink: int
 
 
 def shorten_source(source: str, room: int) -> str:
-    """Return the source; its end if it is too long; "" if there is no space.
+    """Return the source, shortened to fit.
+
+    A source that is too long is replaced by "..." and its end, or by "" if there is hardly space.
 
     Args:
         room: number of characters that are available.
@@ -64,7 +66,7 @@ def write_side(
     """Write statistics, colours and keys at the right of the picture.
 
     Args:
-        left: the first column to the right of the picture.
+        left: index of the leftmost column of this side panel, directly right of the picture.
         figures: the statistics, one per line.
     """
     columns, lines = window.size

@@ -207,7 +207,7 @@ def test_without_intensity_colours_show_the_range() -> None:
 def test_the_side_view_has_the_same_scale_and_up_is_up() -> None:
     wall = [(4.0, y, z) for y in np.linspace(-2, 2, 100) for z in np.linspace(0, 3, 60)]
     lines = draw_lines(cloud(*wall), TALL, 60, 44)
-    title = next(row for row, line in enumerate(lines) if "from the right" in line)
+    title = next(row for row, line in enumerate(lines) if "front at the right" in line)
     above, side = dots(lines[:title]), dots(lines[title + 1 :])
     column = most(column for _, column in side)
     line = most(row for row, _ in above)

@@ -67,7 +67,7 @@ def test_readings_follow_each_other_without_a_gap_or_an_overlap() -> None:
         first = number * frames_per_reading
         for place in range(first, first + frames_per_reading):
             bench.feed(bench.frames[place], START + place * 1_000_000)
-        found = bench.meter.reading(bench.decoder.stats)
+        found = bench.meter.take_reading(bench.decoder.stats)
         whole += found.packets
         assert found.packets == frames_per_reading
         assert found.packet_rate_hz == pytest.approx(1000)
@@ -111,7 +111,7 @@ def test_without_arrival_times_rates_are_by_the_sensors_clock() -> None:
 
 def test_before_any_data_there_are_no_figures() -> None:
     bench = Bench()
-    found = bench.meter.reading(bench.decoder.stats)
+    found = bench.meter.take_reading(bench.decoder.stats)
     assert (found.packets, found.scans, found.error_rate) == (0, 0, 0.0)
     assert {found.speed_hz, found.packet_rate_hz, found.jitter_s, found.points, found.seconds} == {
         None
@@ -134,7 +134,7 @@ def test_the_speed_is_exact_for_coarse_arrival_times_and_ignores_lost_ends() -> 
     # Fifteen scans a second in steps of 10 ms. The end of one scan is lost.
     for period_ms in [70, 60, 70] * 20 + [130]:
         tally.add_scan(400, 390, 1000 / period_ms)
-    found = tally.reading(Counters(), seconds=None, counts_losses=False)
+    found = tally.make_reading(Counters(), seconds=None, counts_losses=False)
     assert found.speed_hz == pytest.approx(15)
 
 
@@ -145,5 +145,5 @@ def test_half_of_the_scans_without_their_ends_do_not_change_the_speed(
     tally = RateTally(Counters())
     for period_s in periods_s:
         tally.add_scan(400, 390, 1 / period_s)
-    found = tally.reading(Counters(), seconds=None, counts_losses=False)
+    found = tally.make_reading(Counters(), seconds=None, counts_losses=False)
     assert found.speed_hz == pytest.approx(10)

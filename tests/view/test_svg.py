@@ -64,7 +64,7 @@ def test_labels_are_whole_and_apart(middle: tuple[float, float]) -> None:
 def test_a_few_far_points_do_not_shrink_the_picture() -> None:
     points = cloud(*walls(30, 5), *[(900.0, 700.0, 50.0)] * 4)
     picture = svg(points, fit_to_points(points, choose_appearance(points)), "title").partition(
-        "from the right"
+        "side view"
     )[0]
     (scale,) = re.findall(r"scale\(([\d.]+)\)", picture)
     found = []

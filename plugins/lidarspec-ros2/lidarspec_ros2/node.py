@@ -214,7 +214,7 @@ class LidarNode(LifecycleNode):
                 self._check_connection(device)
                 if (now := time.monotonic()) >= next_diagnostics:
                     next_diagnostics = now + DIAGNOSTICS_PERIOD_S
-                    reading = feed.meter.reading(
+                    reading = feed.meter.take_reading(
                         device.stats, DIAGNOSTICS_PERIOD_S if device.is_live else None
                     )
                     self._run_in_executor(

@@ -358,7 +358,7 @@ class Broadcast:
 
     def _make_statistics(self, duration_s: float) -> dict[str, Any]:
         stats = self.device.stats
-        reading = self._feed.meter.reading(stats, duration_s if self.is_live else None)
+        reading = self._feed.meter.take_reading(stats, duration_s if self.is_live else None)
         now = self.now()
         latency_s = None
         if self.is_live and self.shown is not None:
