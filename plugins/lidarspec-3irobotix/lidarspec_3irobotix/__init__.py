@@ -1,12 +1,13 @@
 """3iRobotix Delta-2A, 2B, 2D and 2G, and the LDS08RR with the same packets.
 
-Lidars of vacuum cleaners, which send without a request. The host drives the motor with PWM.
+These lidars are built into vacuum cleaners, and send without a request. The host drives the motor
+with PWM.
 
 Source: the drivers kaiaai/LDS (LDS_DELTA_2A and related classes, LDS_LDS08RR) and lds2d; two
 packets of a Delta-2A from another driver's tests. There is no public manual. A packet has only the
 angle of its first sample. A packet covers 360 degrees divided by the number of packets per
-revolution, which is 16, or 15 for a 2G. The zero offset in the packets is not added to the angles,
-as in the drivers.
+revolution, which is 16, or 15 for a 2G. Like the drivers, this module does not add the zero offset
+in the packets to the angles.
 """
 
 from __future__ import annotations
@@ -106,7 +107,13 @@ def points(f: Fields, packets: int) -> Polar:
 
 
 def starts_on_grid(f: Fields, packets: int) -> Any:
-    """Return whether the start angle is a multiple of a packet's angle, but not 0."""
+    """Return whether the start angle is a multiple of the angle that one packet covers.
+
+    0 is excluded, because packets of every model start at 0.
+
+    Args:
+        packets: packets per revolution of the model.
+    """
     return (f.start_angle > 0) & (f.start_angle % (360 / packets) == 0)
 
 

@@ -106,7 +106,7 @@ def make_message(size: int, *fields: Any, out: bool = False) -> Frame:
 
 
 def is_known_reply(f: Fields) -> Any:
-    """Return whether the id belongs to a reply of one byte."""
+    """Return whether the id is one of the ids for which the reply contains a single byte."""
     return (
         (f.id == RESET) | (f.id == FORMAT) | (f.id == OUTPUT) | (f.id == FACTORY) | (f.id == SAVE)
     )

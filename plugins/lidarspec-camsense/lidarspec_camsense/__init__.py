@@ -82,7 +82,8 @@ def make_data_frame(form: int, count: int, *rest: Construct) -> Frame:
     struct_with_sum = Checksummed(struct, field="checksum", algorithm=Fold15())
     if count > 8:
         acknowledged = {
-            "LS310": "the sum loses the highest bits of the first words of a long packet"
+            "LS310": "errors in the highest bits of the first words of a long packet are not"
+            " detected, because these bits overflow in the sum"
         }
     else:
         acknowledged = {}

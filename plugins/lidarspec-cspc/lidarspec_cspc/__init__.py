@@ -10,9 +10,10 @@ Known errors of the manual: The printed sum of the device information, 0x0402, s
 in v1.1. In the angle example, the corrections 10.9442 and 11.8653 degrees should be 10.9445 and
 11.8674 (at 1000 and 8000 mm), and 71.1718 should be 71.171875.
 
-Known gaps of the manual: The order of the checksum is missing; the grouping in this module fits
-every captured packet. The baud rate is missing. There is no rule for packets that cross 360 degrees
-or have one sample. A COIN-D4 sends the fillers FE, FF and FA FA, which no manual mentions.
+Known gaps of the manual: The manual does not say how the bytes of a packet are grouped into the
+words of the checksum; the grouping in this module fits every captured packet. The baud rate is
+missing. There is no rule for packets that cross 360 degrees or have one sample. A COIN-D4 sends the
+fillers FE, FF and FA FA, which no manual mentions.
 
 The facts about the COIN-D4A come from the vendor's driver, and the facts about the COIN-D6 from
 published captures. Both models are assumed to report their names. The M1C1_Mini of the manual's
@@ -284,7 +285,7 @@ def points(f: Fields, zero: str = "data", has_exposure: bool = False) -> Polar:
 
 
 def older_points(f: Fields, zero: str = "data") -> Polar:
-    """Return the points of a packet of the older M1C1_Mini, all at the packet's time."""
+    """Return the points of a packet of the M1C1_Mini v1.1, all at the packet's time."""
     return Polar(range=f.samples.distance, azimuth=-np.deg2rad(directions(f, zero)[1]))
 
 
@@ -374,7 +375,7 @@ def change_speed(sweep: RotationSweep, i: int, hertz: float) -> RotationSweep:
 
 
 def older_sweep(i: int) -> dict[str, float]:
-    """Return the simulated values of packet i of the older M1C1_Mini."""
+    """Return the simulated values of packet i of the M1C1_Mini v1.1."""
     return {
         name: value
         for name, value in RotationSweep()(i).items()
@@ -383,7 +384,11 @@ def older_sweep(i: int) -> dict[str, float]:
 
 
 def make_request(mode: str, **more: Any) -> Command:
-    """Return a command whose acknowledgement has the same mode as the command."""
+    """Return a command that the sensor acknowledges with the mode of the command.
+
+    The name of the mode is the same in the command and in the acknowledgement; the byte of the
+    acknowledgement is that of the command, XORed with A0.
+    """
     return Command(
         "command", {"mode": mode}, reply="ack", matches={"mode": mode}, retries=1, **more
     )
@@ -406,15 +411,19 @@ def make_start_packets(
 
 
 def has_customer_firmware(f: Fields) -> Any:
-    """Return whether a packet has the upper bits of M&T set, but no start flag.
+    """Return whether `mt.m` of a packet can be the customer firmware: not 0, and no start packet.
 
-    Source: manual 2.2.3, M&T.
+    In a start packet, `mt.m` is the scan rate. Source: manual 2.2.3, M&T.
     """
     return (f.mt.start == 0) & (f.mt.m > 0)
 
 
-def has_bits_beside_firmware(f: Fields) -> Any:
-    """Return whether the upper bits of M&T differ from the customer firmware."""
+def contradicts_firmware(f: Fields) -> Any:
+    """Return whether `mt.m` of a packet is neither 0 nor the scan rate nor the customer firmware.
+
+    The customer firmware is in the packets that directly follow a start packet. The result for the
+    first packet is False, because the packet before it is unknown.
+    """
     begins = np.asarray(f.mt.start == 1)
     values = np.asarray(f.mt.m)
     follows_start = np.concatenate([np.zeros_like(begins[:1]), begins[:-1]])
@@ -436,7 +445,7 @@ def reports_firmware(f: Fields) -> Any:
 # protocol)
 TMINI_RELATIVE = Relative(
     "bits 1 to 7 of the third byte contain values other than the firmware number",
-    has_bits_beside_firmware,
+    contradicts_firmware,
 )
 YDLIDAR_RELATIVES: dict[str, str | Relative] = {
     **dict.fromkeys(

@@ -6,8 +6,8 @@ mirror. The azimuth of a point is therefore twice the mirror's angle from the st
 plus the azimuth of the channel, plus a correction for the channel. The unit's file has the
 corrections for every two degrees of the mirror.
 
-The CRCs are probably the same as in packets of a QT128. No captured packet was available, so the
-CRCs are not verified.
+The CRCs probably cover the same bytes as in packets of a QT128. No captured packet was available
+to confirm this, so the CRCs are read but not checked.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v4_3.h, udp4_3_parser.cc: packets, axes, correction files
 of version 1.5, azimuth jump between scans; correction files of an AT128E2X); tier4/nebula (times,
@@ -108,7 +108,10 @@ class Mirror(Calibration):
     elevation_adjust: Table | None = None
 
     def with_file(self, path: str | Path | Learned) -> Mirror:
-        """Return a copy with the angles of one unit, from its file (.dat) or its reply.
+        """Return a copy with the angles of one unit.
+
+        Args:
+            path: the unit's correction file (.dat), or its reply to the command `get_calibration`.
 
         Raises:
             UsageError: if the file cannot be read, or belongs to another model.
@@ -184,7 +187,7 @@ TAIL = (
     ),
     "tail_reserved_2" / Bytes(11),
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since `utc`",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the date and time in `utc`",
     "return_mode" / RETURN_MODE,
     "factory" / Int8ul * FACTORY,
     "utc" / UTC,
@@ -250,7 +253,7 @@ AT128 = make_spinning_sensor(
     "hesai-at128",
     {
         "data": Frame(
-            make_packet(VERSION, CHANNEL[LASERS], TAIL, block=Int8ul, safety=False),
+            make_packet(VERSION, CHANNEL[LASERS], TAIL, fine_azimuth=Int8ul, safety=False),
             data=True,
             max_length=max_packet_bytes(BLOCKS, 3 + 4 * LASERS),
             plausible=plausible,

@@ -76,7 +76,10 @@ class Calibration:
         return len(self.elevation)
 
     def with_file(self, path: str | Path | Learned) -> Calibration:
-        """Return a copy with the angles of a unit, from a correction file or its reply.
+        """Return a copy with the angles of one unit.
+
+        Args:
+            path: the unit's correction file, or its reply to the command `get_calibration`.
 
         Raises:
             UsageError: if the file cannot be read, or belongs to another model. The error has the
@@ -122,7 +125,8 @@ def configure(
         points: a function that returns points, given `Fields` and the unit's `Calibration`.
         table: the nominal corrections of the model.
         calibration: a CSV file with the columns Channel (or Laser id), Elevation and Azimuth, in
-            degrees and in any order; or a binary file, if the model has one; or the unit's reply.
+            degrees and in any order; or a binary file, if the model has one; or the unit's reply to
+            the command `get_calibration`.
         firing_times: a CSV file with the columns Channel and Fire time, in microseconds.
 
     Raises:
@@ -214,7 +218,10 @@ def read_rows(path: str | Path | Learned) -> list[tuple[int, list[str]]]:
 
 
 def read_content(path: str | Path | Learned) -> bytes:
-    """Return the bytes of a correction file, or of a unit's reply.
+    """Return the bytes of a correction file.
+
+    Args:
+        path: the path of the file, or the bytes that a unit has sent in reply to `get_calibration`.
 
     Raises:
         UsageError: if the file cannot be read, or is too long.
@@ -234,7 +241,7 @@ def read_content(path: str | Path | Learned) -> bytes:
 
 
 def find_column(path: str | Path | Learned, line: int, headings: list[str], column: Column) -> int:
-    """Return the index of a column, from 0."""
+    """Return the index of a column; the first column has the index 0."""
     for index, heading in enumerate(headings):
         name, _, unit = heading.lower().partition("(")
         if re.sub(r"[^a-z]", "", name) in column.headings:

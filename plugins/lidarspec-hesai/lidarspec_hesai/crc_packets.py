@@ -1,4 +1,4 @@
-"""Packets with CRCs over blocks, functional safety and tail.
+"""Packets with three CRCs: over the blocks, over the functional safety part, and over the tail.
 
 The models are QT128, Pandar128, OT128, JT128 and AT128.
 
@@ -7,8 +7,9 @@ The models are QT128, Pandar128, OT128, JT128 and AT128.
     [, signature]
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h, udp_protocol_v1_4.h). The bytes that each CRC
-covers were found in a capture of a QT128. The same bytes are assumed for the other models, whose
-CRCs are not verified.
+covers were found in a capture of a QT128. In packets of the other models, the CRCs probably cover
+the same bytes. No captured packet confirms this, so the CRCs of these models are read but not
+checked.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ def make_packet(
     channels: Construct,
     tail: Sequence[Construct],
     *,
-    block: Construct | None = None,
+    fine_azimuth: Construct | None = None,
     blocks: Construct = TWO_BLOCKS,
     imu: bool = False,
     safety: bool = True,
@@ -98,17 +99,17 @@ def make_packet(
 
     Args:
         tail: the fields between functional safety and sequence.
-        block: the type of the fine azimuth, which is between azimuth and channels; None if blocks
-            have no fine azimuth.
+        fine_azimuth: the construct of the fine azimuth, which is between azimuth and channels of a
+            block; None if blocks have no fine azimuth.
         verify_crc: whether CRCs are verified, instead of being plain fields.
     """
     crc = Int32ul if verify_crc else Int32ul * UNCHECKED_NOTE
-    fine_azimuth = [] if block is None else ["fine_azimuth" / block]
+    fine_part = [] if fine_azimuth is None else ["fine_azimuth" / fine_azimuth]
     body = Struct(
         "blocks"
         / Array(
             this._.block_count,
-            Struct("azimuth" / Scaled(Int16ul, 0.01, "deg"), *fine_azimuth, "channels" / channels),
+            Struct("azimuth" / Scaled(Int16ul, 0.01, "deg"), *fine_part, "channels" / channels),
         ),
         "crc" / crc,
     )
@@ -130,7 +131,7 @@ def make_packet(
         "header_reserved" / Bytes(1),
         "lasers" / Const(LASERS, Int8ul),
         "block_count" / blocks,
-        "first_return" / Int8ul * "number of the return in the first block of each firing",
+        "first_return" / Int8ul * "which return the first block of each firing contains",
         "dis_unit" / Scaled(Int8ul, 1, "mm") * "size of one distance step",
         "return_count" / Int8ul * "returns per firing; some models send the maximum number",
         "flags" / FLAGS,
@@ -145,13 +146,14 @@ def make_packet(
     return Checksummed(frame, "tail_crc", CRC, over=[part.name for part in covered])
 
 
-def max_packet_bytes(blocks: int, block: int) -> int:
+def max_packet_bytes(blocks: int, block_bytes: int) -> int:
     """Return the size of a packet with all parts, in bytes.
 
     Args:
-        block: the size of a block in bytes.
+        blocks: the number of blocks.
+        block_bytes: the size of one block.
     """
-    return 12 + blocks * block + 4 + 17 + 32 + 4 + 22 + 4 + 32
+    return 12 + blocks * block_bytes + 4 + 17 + 32 + 4 + 22 + 4 + 32
 
 
 def plausible(f: Fields) -> Any:
@@ -184,7 +186,7 @@ def packet_values(values: dict[str, Any], **more: int) -> dict[str, Any]:
     """Return the values of a simulated packet with single return and the UDP sequence.
 
     Args:
-        values: the values of the packet. Paths that begin with `blocks` are moved below `body`.
+        values: path of a field -> value. "blocks.x" is accepted as short for "body.blocks.x".
         more: further flags and fields of the header.
     """
     flags = {

@@ -2,8 +2,9 @@
 
     EE FF  major minor  reserved(2) | lasers blocks first_return dis_unit return_num flags
 
-Source: HesaiLidar_SDK_2.0 (udp_protocol_header.h, udp_protocol_v3_1.h, udp_protocol_v6_1.h); the
-length rule is verified with captures of a PandarQT64 and a Pandar XT.
+Source: HesaiLidar_SDK_2.0 (udp_protocol_header.h, udp_protocol_v3_1.h, udp_protocol_v6_1.h). The
+length of a packet follows from the numbers of lasers and blocks in the header; captures of a
+PandarQT64 and a Pandar XT confirm this.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def make_packet(major: int, minor: int, lasers: int, tail: Sequence[Construct]) 
         "header_reserved" / Bytes(2),
         "lasers" / Const(lasers, Int8ul),
         "block_count" / Int8ul,
-        "first_return" / Int8ul * "number of the return in the first block of each firing",
+        "first_return" / Int8ul * "which return the first block of each firing contains",
         "dis_unit" / Scaled(Int8ul, 1, "mm") * "size of one distance step",
         "return_count"
         / Int8ul
@@ -80,7 +81,7 @@ def distance(f: Fields) -> Any:
 
 
 def block_numbers(f: Fields) -> Any:
-    """Return the number of each block in its packet, from 0, (n, blocks, 1)."""
+    """Return the index of each block in its packet, (n, blocks, 1); the first index is 0."""
     return f.block_count.steps()[:, None]
 
 

@@ -1,9 +1,9 @@
-"""Hesai JT128: the packet of a Pandar128E3X with a status of at least 137.
+"""Hesai JT128: packets like those of a Pandar128E3X, with a `status_version` of at least 137.
 
-Unlike in a Pandar128E3X, the header contains the number of blocks, the motor speed has steps of 0.1
-rpm, and the packet's time is 1.888 ms after the last shot. The usual number of blocks, the range
-limits and the rotation speed are not public. The simulation has 2 blocks per packet, and 10
-revolutions a second.
+A packet differs from one of a Pandar128E3X in three points: the number of blocks in the header may
+be other than 2, the motor speed has steps of 0.1 rpm, and the packet's time is 1.888 ms after the
+last shot. The usual number of blocks, the range limits and the rotation speed are not public. The
+simulation has 2 blocks per packet, and 10 revolutions a second.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc; angle and firing-time files of
 the model).

@@ -65,7 +65,7 @@ def make_packet(data_type: int, *body: Any) -> Struct:
         "time_version" / Int8ul,
         "data_type" / Const(data_type, Int8ul),
         "utc" / UTC,
-        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since `utc`",
+        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the date and time in `utc`",
         *body,
         "crc" / Int32ul,
     )

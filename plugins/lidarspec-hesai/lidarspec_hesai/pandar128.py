@@ -6,8 +6,8 @@ A packet has 861 bytes, 893 with a signature:
     2 x [azimuth, 128 x (distance, reflectivity [, confidence] [, weight] [, environment])], CRC
     [safety], tail [, sequence] [, IMU], CRC [, signature]
 
-The models differ in the status. The CRCs are probably the same as in packets of a QT128. No
-captured packet was available, so the CRCs are not verified. The operational state and the azimuth
+The models differ in the status. The CRCs probably cover the same bytes as in packets of a QT128. No
+captured packet was available to confirm this, so the CRCs are read but not checked. The operational state and the azimuth
 state of the block determine which channels fire and when. Below 2.85 m, 32 channels of a
 Pandar128E3X fire 0.8 to 16.7 us later than in the tables of this module.
 
@@ -168,7 +168,7 @@ def make_tail(speed: float) -> Any:
         "return_mode" / RETURN_MODE,
         "motor_speed" / Scaled(Int16ul, speed, "rpm"),
         "utc" / UTC,
-        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since `utc`",
+        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the date and time in `utc`",
         "factory" / Int8ul * FACTORY,
     )
 
@@ -225,9 +225,13 @@ def channel_times(groups: str, times_us: Mapping[str, Sequence[float]]) -> Any:
 
 
 def relatives(own: str) -> dict[str, Relative]:
-    """Return, by id, how to recognize the models that send these packets.
+    """Return how to recognize each of the other models that send these packets.
 
-    `own` is the id of the model to leave out.
+    Args:
+        own: the id of the model for which the others are described.
+
+    Returns:
+        Id of another model -> how its packets differ.
     """
     others = {
         "hesai-pandar128": Relative(

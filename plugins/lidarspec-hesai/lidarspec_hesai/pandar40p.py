@@ -93,7 +93,10 @@ def points(f: Fields, channels: Calibration) -> Polar:
 
 
 def pace(f: Fields, blocks: int) -> Any:
-    """Return the duration of the shots of a packet in seconds (HesaiLidar_SDK_2.0)."""
+    """Return the seconds from a packet to the next: the duration of the shots of a packet.
+
+    Source: HesaiLidar_SDK_2.0.
+    """
     return SHOT_PERIOD_S * blocks / count_returns(f.return_mode)
 
 

@@ -55,7 +55,7 @@ TAIL_40P = (
     "shutdown" / Int8ul * "1: overheated, about to shut down",
     "tail_reserved" / Bytes(2),
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since `utc`",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the date and time in `utc`",
     "return_mode" / RETURN_MODE,
     "factory" / Int8ul * FACTORY,
     "utc" / UTC,

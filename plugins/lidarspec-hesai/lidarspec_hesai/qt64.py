@@ -62,7 +62,7 @@ FIRING_US = (
 TAIL = (
     "reserved" / Bytes(10),
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since `utc`",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the date and time in `utc`",
     "return_mode" / RETURN_MODE,
     "factory" / Int8ul * FACTORY,
     "utc" / UTC,

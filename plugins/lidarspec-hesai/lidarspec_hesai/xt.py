@@ -44,7 +44,7 @@ TAIL = (
     "return_mode" / RETURN_MODE,
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
     "utc" / UTC,
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since `utc`",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the date and time in `utc`",
     "factory" / Int8ul * FACTORY,
 )
 

@@ -106,7 +106,10 @@ def make_reply(command: bytes, lines: Mapping[str, str]) -> Frame:
     return Frame(
         struct,
         max_length=1000,
-        acknowledged={"LS310": "the check character has only the low six bits of the sum"},
+        acknowledged={
+            "LS310": "the check character contains only the low six bits of the sum, so it does not"
+            " detect every error"
+        },
     )
 
 
@@ -165,8 +168,10 @@ URG_ORDERS: dict[str, tuple[bytes, int, dict[str, Any]]] = {
 }
 
 
-def list_orders(kind: str, *, is_urg: bool) -> dict[str, tuple[bytes, int, dict[str, Any]]]:
-    """Return the commands of a scanner that sends scans of this kind.
+def list_command_formats(
+    kind: str, *, is_urg: bool
+) -> dict[str, tuple[bytes, int, dict[str, Any]]]:
+    """Return the formats of the commands of a scanner that sends scans of this kind.
 
     Returns:
         name -> (letters of the command, number of characters after the letters, arguments of
@@ -182,7 +187,7 @@ def list_orders(kind: str, *, is_urg: bool) -> dict[str, tuple[bytes, int, dict[
 @cache
 def make_messages(kind: str, *, is_urg: bool) -> dict[str, Frame]:
     """Return the frames of all commands and replies except scans."""
-    rows = list_orders(kind, is_urg=is_urg)
+    rows = list_command_formats(kind, is_urg=is_urg)
     frames = dict[str, Frame]()
     for name, (command, size, _) in rows.items():
         frames[f"{name}_order"] = make_command_frame(command, size)
@@ -205,7 +210,7 @@ def make_commands(kind: str, steps: bytes, *, is_urg: bool) -> dict[str, Command
     """
     values = {"start": {"value": steps + b"000"}, "get_scan": {"value": steps}}
     commands = dict[str, Command]()
-    for name, (_, size, more) in list_orders(kind, is_urg=is_urg).items():
+    for name, (_, size, more) in list_command_formats(kind, is_urg=is_urg).items():
         reply = VALUE_REPLIES.get(name, f"{name}_answer")
         arguments: dict[str, Any] = {"reply": reply, "retries": 1, **more}
         if name not in VALUE_REPLIES and name != "laser_on":

@@ -173,7 +173,10 @@ def make_scan_frame(command: str, geometry: Geometry) -> Frame:
         max_length=MAX_SCAN_CHARACTERS[echoes],
         plausible=partial(plausible, end=geometry.end),
         points=partial(points, geometry=geometry, echoes=echoes),
-        acknowledged={"LS711": "the step numbers of this model have at most three digits"}
+        acknowledged={
+            "LS711": "the first of the four digits of a step number is always 0, because this model"
+            " has fewer than 1000 steps"
+        }
         if geometry.end < 1000
         else {},
         wire=Lines(LINE_CHARACTERS, head=(15 if is_continuous else 12, 2, 4), bare=1, check=Scip())
@@ -182,7 +185,7 @@ def make_scan_frame(command: str, geometry: Geometry) -> Frame:
 
 
 def pace(f: Fields, rate: float) -> Any:
-    """Return the seconds from a scan to the next; nan for single scans.
+    """Return the seconds from a scan to the next; nan for a scan that was requested singly.
 
     Source: SCIP 2.0, 8.1.
 

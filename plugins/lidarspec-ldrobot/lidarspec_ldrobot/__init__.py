@@ -2,11 +2,11 @@
 
 The models measure by time of flight or by triangulation and send data without a request.
 
-Source: STL-27L development manual, section 3. Rates, baud rates and all frames except the data come
-from the vendor's SDKs (ldlidar_sdk, ldlidar_stl_ros2). LD06, LD19 and STL-19P have the same frame,
-baud rate and point rate, so they are a single sensor in this plugin. An LD14 measures by
-triangulation. Its angles are converted to angles around the axis of rotation, as in the SDK
-(sl_transform.cpp). An older LD14P measures 2300 points a second.
+Source: STL-27L development manual, section 3. Point rates, baud rates, and all frames except the
+data frame come from the vendor's SDKs (ldlidar_sdk, ldlidar_stl_ros2). LD06, LD19 and STL-19P have
+the same frame, baud rate and point rate, so they are a single sensor in this plugin. An LD14
+measures by triangulation. Its angles are converted to angles around the axis of rotation, as in the
+SDK (sl_transform.cpp). An older LD14P measures 2300 points a second.
 
 The replies of an LD14P to commands are not documented, so commands do not wait for a reply. The
 baud rates of LD20, STL-06P and STL-26 are assumed to be the LD19's. No captured frame of an STL-06P
@@ -194,7 +194,14 @@ def pace(f: Fields, rate: int, older_rate: int | None = None) -> Any:
 
 
 def relatives(own: str) -> dict[str, str | Relative]:
-    """Return how to recognize each of the other models by its point rate."""
+    """Return how to recognize each of the other models by its point rate.
+
+    Args:
+        own: the name of the model for which the others are described, a key of `POINT_RATES_HZ`.
+
+    Returns:
+        Id of another model -> how its frames differ.
+    """
     others = {make_id(name): rate for name, rate in POINT_RATES_HZ.items() if name != own}
     others["oradar-ms200"] = MS200_POINT_RATE_HZ
     return {

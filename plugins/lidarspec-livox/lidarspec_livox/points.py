@@ -48,7 +48,7 @@ def make_returns(count: int, *members: Any) -> Any:
 
 
 def cartesian(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) -> Cartesian:
-    """Return points from the sent x, y and z, which are in REP-103 axes.
+    """Return the points of a packet that contains x, y and z, which are in REP-103 axes.
 
     Args:
         time: the time of each shot, in seconds after the packet's clock.
@@ -62,9 +62,9 @@ def cartesian(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) ->
 
 
 def spherical(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) -> Polar:
-    """Return points from depth, azimuth and zenith angle (the angle from the z axis).
+    """Return the points of a packet that contains depth, azimuth and zenith angle.
 
-    The arguments are the same as for `cartesian`.
+    The zenith angle is the angle from the z axis. The arguments are the same as for `cartesian`.
     """
     members = f.points if returns == 1 else f.points.returns
     azimuth = np.deg2rad(f.points.azimuth)

@@ -148,7 +148,7 @@ def make_packet(kind: int, *members: Any) -> Struct:
 
 
 def clock(f: Fields) -> tuple[Any, ...]:
-    """Return four exact terms whose sum is the time in seconds."""
+    """Return the time in seconds, as four terms that are exact; their sum would be rounded."""
     low = f.timestamp.low
     middle = f.timestamp.middle
     high = f.timestamp.high
@@ -265,8 +265,8 @@ def make_message(packet_type: int, number: tuple[int, int] | None, *members: Any
         SOF,
         "version" / Const(1, Int8ul),
         "length" / SizeOf(Int16ul, "_"),
-        "packet_type" / Const(packet_type, Int8ul) * "0: command, 1: reply, 2: message",
-        "seq" / Int16ul * "message number; a reply has the number of its command",
+        "packet_type" / Const(packet_type, Int8ul) * "0: request, 1: reply, 2: notification",
+        "seq" / Int16ul * "number of the frame; a reply has the number of its request",
         "crc16" / Int16ul,
     )
     names = ("cmd_set", "cmd_id")
@@ -585,7 +585,10 @@ def make_lidar(name: str) -> Sensor:
         },
         status="manual",
         acknowledged=(
-            {"LS507": "the walls of the small simulated room are nearer than the shortest range"}
+            {
+                "LS507": "the sensor cannot measure the walls of the small simulated room, because"
+                " they are nearer than its shortest range"
+            }
             if limits[0] > 1
             else {}
         ),

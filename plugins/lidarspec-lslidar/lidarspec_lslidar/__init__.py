@@ -2,10 +2,11 @@
 
 Numbers are big-endian. The C16 is in the module `c16`.
 
-Source: the vendor's ROS drivers (lslidar_driver.cc of the edition for the N10P;
-lslidar_x10_driver.cpp of Lslidar_ROS2_driver V5). Packets of the N10 and N10P end with a checksum,
-which is a sum. Packets of the M10 family have no checksum, only constant bytes at both ends. The
-value that the older driver calls speed is the time for 15 degrees, in microseconds.
+Source: the vendor's ROS drivers, of which the older is lslidar_driver.cc of the edition for the
+N10P, and the newer is lslidar_x10_driver.cpp of Lslidar_ROS2_driver V5. Packets of the N10 and N10P
+end with a checksum, which is a sum. Packets of the M10 family have no checksum, only constant bytes
+at both ends. The value that the older driver calls speed is the time for 15 degrees, in
+microseconds.
 
 Angles are clockwise in the older driver and in this module, but counter-clockwise in the newer
 driver. For an M10, both drivers divide 15 degrees by the number of samples that are not FFFF. This
@@ -252,7 +253,9 @@ INFO = Frame(
         "compensation"
         / BitStruct(
             "negative" / BitsInteger(1),
-            "angle" / Scaled(BitsInteger(15), 0.01, "deg") * "`points` does not apply this angle",
+            "angle"
+            / Scaled(BitsInteger(15), 0.01, "deg")
+            * "angle correction that the sensor reports; it is not applied to decoded points",
         ),
         "reserved" / Bytes(11),
         "end" / END,

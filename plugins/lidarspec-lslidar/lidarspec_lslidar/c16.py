@@ -147,7 +147,7 @@ def points(f: Fields, unit: float = DISTANCE_STEPS_CM[0]) -> Polar:
 
 
 def pace(f: Fields) -> Any:
-    """Return the duration of the blocks of a packet in seconds."""
+    """Return the seconds from a packet to the next: the duration of the blocks of a packet."""
     return np.where(f.return_mode == DUAL, BLOCKS // 2, BLOCKS) * BLOCK_PERIOD_S
 
 

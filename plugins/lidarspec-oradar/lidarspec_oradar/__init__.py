@@ -68,7 +68,7 @@ DATA = Checksummed(
 )
 
 
-def make_order(code: int, *content: Any) -> Frame:
+def make_command_frame(code: int, *content: Any) -> Frame:
     """Return the frame of a command: header, code, type, size, content, XOR, tail."""
     struct = Struct(
         "body"
@@ -125,8 +125,8 @@ MS200 = Sensor(
     model="MS200",
     frames={
         "data": Frame(DATA, data=True, plausible=plausible),
-        "speed": make_order(SET_SPEED, "rate" / Scaled(Int16ul, 1, "Hz")),
-        "mode": make_order(SET_MODE, "mode" / MODES),
+        "speed": make_command_frame(SET_SPEED, "rate" / Scaled(Int16ul, 1, "Hz")),
+        "mode": make_command_frame(SET_MODE, "mode" / MODES),
     },
     points=points,
     scan=OnWrap("azimuth"),

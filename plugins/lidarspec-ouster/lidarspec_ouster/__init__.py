@@ -6,9 +6,9 @@ when the sensor is opened. Without metadata, the user can pass a layout (`rows`,
 and the angles are the nominal angles of an ideal sensor.
 
 Source: Software User Manual of firmware 2.x and 3.x (coordinates, HTTP API); ouster-sdk
-(parsing.cpp, xyzlut.cpp, sensor_http_imp.cpp). The fields of view, and the offsets of OS0, OS1 and
-OS2, are from the data sheets and from one captured unit of each model. The range limits are from
-the data sheets, for bright targets.
+(parsing.cpp, xyzlut.cpp, sensor_http_imp.cpp). The fields of view, and the positions of the beam
+origins of OS0, OS1 and OS2, are from the data sheets and from one captured unit of each model. The
+range limits are from the data sheets, for bright targets.
 """
 
 from __future__ import annotations
@@ -168,7 +168,13 @@ def apply_unit(sensor: Sensor, unit: Unit) -> Sensor:
 
 
 def make_nominal_unit(model: str, rows: int, turn: int, profile: str) -> Unit:
-    """Return a unit with the values of the data sheet."""
+    """Return a unit with the values of the data sheet.
+
+    Args:
+        rows: the number of pixels per column.
+        turn: the number of columns per revolution.
+        profile: the packing of pixels, a key of `PROFILES`.
+    """
     line, low, high, beam_origin, height, _ = MODELS[model]
     beam_transform = np.eye(4)
     lidar_transform = np.diag([-1.0, -1.0, 1.0, 1.0])

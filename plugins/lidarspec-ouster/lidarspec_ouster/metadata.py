@@ -74,8 +74,10 @@ class Unit:
         azimuth: (rows,) the azimuth of each beam in degrees, clockwise.
         shifts: (rows,) the number of columns by which each row is shifted in an image, for
             `PointCloud.destagger`.
-        beam, lidar, imu: transforms (4, 4) with millimetres: from beam to lidar, from lidar to
-            sensor, and from IMU to sensor.
+        beam: the transform from the axes of the beams to those of the lidar, (4, 4), with a
+            translation in millimetres.
+        lidar: the transform from the axes of the lidar to those of the sensor, likewise.
+        imu: the transform from the axes of the IMU to those of the sensor, likewise.
         samples: samples per IMU packet; 0 for LEGACY packets.
         product, serial: the product line and the serial number in the metadata; "" if missing.
         timestamp_mode: the source of the time, a key of `TIME_EPOCHS`; "" if unknown.

@@ -31,7 +31,11 @@ Bytes2D = NDArray[np.uint8]
 
 
 def recognise(datagrams: Sequence[bytes]) -> dict[str, Any]:
-    """Return the options of `configure` with which most of the datagrams are valid."""
+    """Return the layout of most of the datagrams, as options of `configure`.
+
+    Returns:
+        "profile", "rows" and "turn" -> the most likely values; empty if no layout fits.
+    """
     lengths = [len(data) for data in datagrams]
     layouts = {
         (profile, rows): packet_bytes(profile, rows) for profile in PROFILES for rows in ROW_COUNTS
@@ -114,10 +118,12 @@ def split_columns(packets: Bytes2D, profile: str) -> Bytes2D | None:
 
 
 def row_similarity(columns: Bytes2D, profile: str, rows: int) -> float:
-    """Return how similar the mean ranges of four groups of rows are, from 0 to 1.
+    """Return how similar the mean ranges of adjacent rows are if columns have this layout.
 
-    The result is the smallest mean range divided by the largest mean range; -1 if unused bits are
-    set in many pixels.
+    Returns:
+        -1 if unused bits are set in many pixels, which means that the layout is probably wrong.
+        Otherwise a number from 0 to 1: each of four groups contains every fourth row, and the
+        smallest mean range of a group is divided by the largest mean range of a group.
     """
     start = 16 if profile == "LEGACY" else 12
     bits = PROFILES[profile]

@@ -6,8 +6,8 @@ Without ``feed_watchdog``, the output ends after a minute.
 
 Source: R2000 Ethernet communication protocol, version 1.04, chapters 1 and 3, as repeated in the
 vendor's drivers: pf_lidar_ros_driver (PFHeader.msg, PFR2000Header.msg, pf_r2000_packet_a, _b and
-_c.cpp, pfsdp_base.cpp, PFDriverR2000.cfg, the tables of its topics for `status_flags`) and the
-older pepperl_fuchs_r2000 (packet_structure.h). The range is assumed to be that of an OMD30M. An
+_c.cpp, pfsdp_base.cpp, PFDriverR2000.cfg, and for `status_flags` the driver's tables of topics) and
+the older pepperl_fuchs_r2000 (packet_structure.h). The range is assumed to be that of an OMD30M. An
 R2300 has packets of another type.
 """
 
@@ -137,7 +137,7 @@ def make_packet(letter: str) -> Construct:
         "packet_size" / SizeOf(Int32ul),
         "header_size" / OneOf(Int16ul, HEADER_SIZES) * "a multiple of 4",
         "scan_number" / Int16ul * "scan counter",
-        "packet_number" / Int16ul * "number of the packet in its scan, from 1",
+        "packet_number" / Int16ul * "number of the packet in its scan; the first is 1",
         "timestamp_raw" / make_time() * "time of the first sample, counted from power-on",
         "timestamp_sync"
         / make_time()
