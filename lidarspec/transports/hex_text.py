@@ -377,12 +377,10 @@ def find_cut(text: str) -> int:
 
     If the text is a single word, the result is the last index that does not split a byte.
     """
-    return (
-        max(
-            *(text.rfind(mark) + 1 for mark in " \t\n,;:{}"), *(text.rfind(mark) for mark in "\\/#")
-        )
-        or len(text) // 2 * 2
-    )
+    after_separator = max(text.rfind(mark) + 1 for mark in " \t\n,;:{}")
+    comment = text.find("//") if "//" in text else text.rfind("/")
+    before_mark = max(comment, *(text.rfind(mark) for mark in "\\#"))
+    return max(after_separator, before_mark) or len(text) // 2 * 2
 
 
 def parse_hex(text: str) -> bytes:

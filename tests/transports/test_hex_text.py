@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gzip
+import io
 import re
 import shutil
 import subprocess
@@ -57,6 +58,18 @@ def test_a_line_without_end_is_read_in_pieces(
         found = [chunk.data for chunk in opened.chunks()]
     assert b"".join(found) == parse_hex(line) * 2 + parse_hex(form) * (block // len(form))
     assert max(map(len, found)) <= block
+
+
+@pytest.mark.parametrize("comment", ["//", "///", "//a/b", "#a//b"])
+@pytest.mark.parametrize("digits", range(0, 18, 2))
+def test_a_comment_at_the_end_of_a_piece_is_a_comment(
+    comment: str, digits: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hex_text, "BLOCK_BYTES", 16)
+    for noise in range(4):
+        line = io.BytesIO(f"{'8b' * (digits // 2)}{comment}{'x' * (20 + noise)}\n5a\n".encode())
+        found = [chunk.data for chunk in hex_text.iter_hex_chunks("a.hex", line.readline)]
+        assert b"".join(found) == b"\x8b" * (digits // 2) + b"\x5a"
 
 
 def test_a_single_digit_is_a_byte_only_with_a_prefix() -> None:
