@@ -260,15 +260,15 @@ class CaptureThread:
 
     def _check_wall_clock(self, chunk: Chunk) -> None:
         """Warn if the computer's wall clock was set, and record the change."""
-        ahead = self._clock.find_step()
-        if ahead is None:
+        step_ns = self._clock.find_step()
+        if step_ns is None:
             return
         self.warnings = [
-            f"the clock of this computer was stepped by {ahead / 1e9:+.3f} s; arrival times"
+            f"the clock of this computer was stepped by {step_ns / 1e9:+.3f} s; arrival times"
             " continue without this step"
         ]
         if self._log is not None:
-            self._log.event("clock", chunk.at, ahead_ns=ahead)
+            self._log.event("clock", chunk.at, ahead_ns=self._clock.lead_ns)
 
     def _reconnect(self) -> bool:
         """Wait until the device is back; return False if the capture was stopped first."""

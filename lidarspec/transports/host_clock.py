@@ -31,7 +31,8 @@ class HostClock:
     def __init__(self, wall: Callable[[], int] = time.time_ns) -> None:
         self._wall = wall
         self._offset_ns = 0
-        self._lead_ns = 0  # how far the wall clock was ahead when `find_step` last reported a step
+        #: How far the wall clock was ahead of this clock when `find_step` last returned a step, ns.
+        self.lead_ns = 0
         for _ in range(_READ_ATTEMPTS):
             self._offset_ns, read_time_ns = self._read_offset()
             if read_time_ns < _MAX_READ_TIME_NS:
@@ -59,18 +60,18 @@ class HostClock:
         return closest[1:]
 
     def find_step(self) -> int | None:
-        """Return how far the wall clock is ahead of this clock in ns, if it was set.
+        """Return by how much the wall clock was set since the last step that was returned, in ns.
 
-        Returns None if the wall clock was not set since the last step that was returned, or since
-        the start. Also returns None if the thread was suspended while the clocks were read; a later
-        call then returns the step.
+        Returns None if the wall clock was not set. Also returns None if the thread was suspended
+        while the clocks were read; a later call then returns the step.
         """
         offset_ns, read_time_ns = self._read_offset()
         lead_ns = offset_ns - self._offset_ns
-        if abs(lead_ns - self._lead_ns) <= _SET_CLOCK_NS or read_time_ns > _MAX_READ_TIME_NS:
+        step_ns = lead_ns - self.lead_ns
+        if abs(step_ns) <= _SET_CLOCK_NS or read_time_ns > _MAX_READ_TIME_NS:
             return None
-        self._lead_ns = lead_ns
-        return lead_ns
+        self.lead_ns = lead_ns
+        return step_ns
 
     def _read_offset(self) -> tuple[int, int]:
         """Return wall clock minus steady clock, and the duration of the reading, ns."""

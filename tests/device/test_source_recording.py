@@ -156,28 +156,32 @@ def test_a_sensor_that_sends_over_ipv6_is_recorded_for_wireshark(tmp_path: Path)
 
 def test_a_clock_change_changes_no_time_and_is_recorded(tmp_path: Path) -> None:
     path, number, wall = tmp_path / "all.lsr", free_port(), [0]
-    sensor = SHAPES["shape-datagrams"]
-    frames, queue = turning(sensor, 4), BoundedQueue()
+    sensor, warnings = SHAPES["shape-datagrams"], list[list[str]]()
+    frames, queue = turning(sensor, 5), BoundedQueue()
     with udp() as sender, Recorder(path, sensor) as kept:
         clock = HostClock(wall=lambda: time.time_ns() + wall[0])
         with contextlib.closing(
             CaptureThread(open_live(f"udp://:{number}", sensor), queue, log=kept, clock=clock)
         ) as capture:
-            for index, step in enumerate((0, 20_000_000, 3_000_000_000, 3_000_000_000)):
+            for index, step in enumerate((0, 20_000_000, 3_000_000_000, 3_000_000_000, 1_000_000_000)):
                 wall[0] = step
                 sender.sendto(frames[index], ("127.0.0.1", number))
                 until(lambda index=index: queue.produced == index + 1)  # type: ignore[misc]
-            (said,) = capture.warnings
-    assert said.startswith("the clock of this computer was stepped by +3.")
+                warnings.append(capture.warnings)
+    assert warnings[0] == warnings[1] == []
+    assert warnings[2] == warnings[3]
+    assert warnings[3][0].startswith("the clock of this computer was stepped by +3.")
+    assert warnings[4][0].startswith("the clock of this computer was stepped by -2.")
     with Recording(path) as recording:
         found = list(recording)
-    assert [record.direction for record in found] == ["in", "in", "event", "in", "in"]
-    assert abs(json.loads(found[2].data)["ahead_ns"] - 3_000_000_000) < 50_000_000
+    assert [record.direction for record in found] == ["in", "in", "event", "in", "in", "event", "in"]
+    for record, lead_ns in ((found[2], 3_000_000_000), (found[5], 1_000_000_000)):
+        assert abs(json.loads(record.data)["ahead_ns"] - lead_ns) < 50_000_000
     times = [record.at for record in found if record.at]
     assert times == sorted(times)
     assert times[-1] - times[0] < 2_000_000_000, "no step"
     with ls.open(path, sensor) as device:
-        assert sum(map(len, device.packets())) == 4
+        assert sum(map(len, device.packets())) == 5
         (said,) = (warning for warning in device.warnings if "clock" in warning)
         assert said == (
             f"{path}: the clock of the computer was stepped during the recording; arrival"
