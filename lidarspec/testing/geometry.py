@@ -636,8 +636,7 @@ def distance_outside(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64
 def find_half_step(subject: SensorUnderTest, name: str) -> float:
     """Return the largest rounding error of a length field of a frame, in metres.
 
-    The error is half of the field's scale. Returns `MIN_HALF_STEP_M` if no length field has a scale
-    above `MIN_HALF_STEP_M`.
+    The error is half of the largest scale of these fields, but at least `MIN_HALF_STEP_M`.
     """
     fields = subject.fields(name).values()
     metres = [
@@ -645,9 +644,7 @@ def find_half_step(subject: SensorUnderTest, name: str) -> float:
         for info in fields
         if factor(info.unit, "m") is not None
     ]
-    if max(metres, default=0) > MIN_HALF_STEP_M:
-        return max([MIN_HALF_STEP_M, *metres]) / 2
-    return MIN_HALF_STEP_M
+    return max(MIN_HALF_STEP_M, max(metres, default=0.0) / 2)
 
 
 def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
