@@ -159,7 +159,9 @@ class FilePiece:
         return self.make_record(error=reason)
 
     def iter_numbered(self, scans: FileScans) -> Iterator[Scan]:
-        """Yield the scans of the piece that `select` selects, numbered from the file's start.
+        """Yield the scans of the piece that `select` selects.
+
+        The number of a scan counts from the start of the file.
 
         Args:
             scans: the reader that `open_scans` has returned.
@@ -586,7 +588,9 @@ def _iter_results(
             raise suggest(
                 error, "repeat the command: it converts only the missing pieces"
             ) from None
-        except Exception as failure:  # of `find_piece_end`, or a Dask worker died repeatedly
+        except (
+            Exception
+        ) as failure:  # in `find_piece_end`, or because a Dask worker died repeatedly
             result = piece.describe_failure(failure)
         if isinstance(result, dict):
             yield result, False

@@ -336,7 +336,7 @@ class PcapngBlocks:
         return length
 
     def length_field(self, length: int) -> tuple[int, str, int]:
-        """Return (offset, NumPy type, value) of the length field, for a length of a block."""
+        """Return (offset, NumPy type, value) of the length field in a block of this length."""
         return 4, f"{self.order}u4", length
 
     def find_layout(self, record: bytes) -> RecordLayout | None:

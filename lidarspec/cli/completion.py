@@ -103,7 +103,7 @@ def _complete_sensors(ctx: click.Context, incomplete: str) -> Iterable[str]:
 def _complete_sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
     """Return devices, ports, simulated sensors, and files that begin with `incomplete`.
 
-    If only files begin with it, returns an empty list: the shell then completes file names.
+    If only files begin with `incomplete`, returns an empty list, and the shell completes the names.
     """
     if incomplete.startswith("sim:"):
         simulated = [f"sim:{name}" for name in registry().names()]

@@ -283,7 +283,7 @@ def _fit_widths(lines: Sequence[Sequence[str]], room: int) -> list[int]:
 def _fold_row(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator[str]:
     """Yield the lines of one row.
 
-    The cells after the last width follow the row, each on indented lines of its own.
+    If the row has more cells than `widths`, the remaining cells are on indented lines after it.
     """
 
     def wrap(cell: str, width: int) -> list[str]:

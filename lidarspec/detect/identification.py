@@ -404,8 +404,8 @@ class Verdict:
     """The sensors that may have sent some bytes.
 
     Attributes:
-        scores: all sensors with many valid frames in the bytes: first the candidates, then the
-            sensors that were ruled out.
+        scores: all sensors with at least `FITTING_SHARE` of the bytes in their frames: first the
+            candidates, then the sensors that were ruled out.
         candidates: the sensors that may have sent the bytes; more than one if nothing
             distinguishes them.
         others: the models that are not installed, but may have sent the bytes: id -> difference

@@ -150,9 +150,10 @@ def describe(sensors: Sequence[KnownSensor]) -> str:
 
 
 def suggest_installation(error: WireError, sample: SampleBytes) -> WireError:
-    """Name the distributions to install in an error about unknown bytes; return the error.
+    """Add an installation note to an error about unknown bytes; return the error.
 
-    The error is not changed if no known sensor may have sent the bytes.
+    The note names the known sensors that may have sent the bytes, and the distributions to install.
+    Without such a sensor, the error is not changed.
     """
     missing = recognize(sample)
     if missing:

@@ -189,8 +189,8 @@ class Device(ClosingContext):
     def packets(self, frame: str | None = None, *, wait: float | None = None) -> Iterator[Packets]:
         """Yield packets in batches, until the input ends or the device is closed.
 
-        A file is read only once: all iterators share one position in it. In a file, an iterator
-        after `latest` begins with the batch of packets in which the returned scan ends.
+        A file is read only once: all iterators share one position in it. After a call of `latest`
+        for a file, a new iterator begins with the batch of packets in which the returned scan ends.
 
         Args:
             frame: the name of a frame type; by default the data frame.
@@ -260,11 +260,11 @@ class Device(ClosingContext):
         """Yield scans, until the input ends or the device is closed.
 
         The first and the last scan, and the scans before and after an interruption, have
-        ``complete=False``. If the end of a scan is missing, the scan is cut when it lasts twice as
-        long as the slowest revolution of the sensor, with a warning.
+        ``complete=False``. If the end of a scan is missing, the scan is yielded with a warning when
+        it lasts twice as long as the slowest revolution of the sensor.
 
-        A file is read only once: all iterators share one position in it. In a file, an iterator
-        after `latest` begins with the packets of the batch in which the returned scan ends.
+        A file is read only once: all iterators share one position in it. After a call of `latest`
+        for a file, a new iterator begins with the batch of packets in which the returned scan ends.
 
         Args:
             wait: if no scan arrives for this number of seconds, yield None.
