@@ -3,11 +3,12 @@
 Numbers are big-endian. Source: the vendor's quanergy_client (packet_header.h,
 m_series_data_packet.h, data_packet_parser_00.cpp, data_packet_parser_04.cpp,
 data_packet_parser_m_series.h). In the client, the time of a packet is the time of its last firing.
-It is assumed that firings are evenly spaced, with 420,000 points a second; range limits and
-revolutions per second are assumed as well. The positions of the firings increase or decrease,
-depending on the direction of rotation. The nanoseconds of packets before version 4 are in units of
-ten nanoseconds, which is not corrected here. Packets of other kinds (1 and 6) and settings over
-HTTP are not supported. No captured packet was available.
+Three things are assumed: the firings are evenly spaced and measure 420,000 points a second, the
+range limits, and the revolutions per second. The positions of the firings increase or decrease,
+depending on the direction of rotation. In packets before version 4, the field `nanoseconds` counts
+steps of 10 ns. This module always reads steps of 1 ns, so the times of these packets are wrong.
+Packets of kind 0 (three returns) and kind 4 (one return) are supported; kinds 1 and 6 and settings
+over HTTP are not supported. No captured packet was available.
 """
 
 from __future__ import annotations
@@ -157,7 +158,7 @@ def one_return_points(f: Fields, elevation: NDArray[np.float64]) -> Polar:
 
 
 def sweep(i: int, more: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the simulated values of packet i, at 10 revolutions a second.
+    """Return the field values of simulated packet i, at 10 revolutions a second.
 
     `more` has the values of fields that only one packet kind has.
     """
@@ -194,8 +195,8 @@ def make_lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: 
                 points=partial(points, elevation=elevation),
                 simulation=Simulation(partial(sweep, more=more)),
                 acknowledged={
-                    "LS507": "a wall gives each laser one return, which the packet repeats as the"
-                    " other two returns"
+                    "LS507": "in the simulated scene each laser has one return, which the packet"
+                    " contains three times"
                 }
                 if more
                 else {},
