@@ -10,10 +10,11 @@ times that depend on how the sensor is mounted, the bits of a distance, dual ret
 a packet of the IMU.
 
 The sources disagree about the axes. In the manual's formula, x is proportional to the sine of the
-azimuth. In rs_driver, x is proportional to the cosine and y to the negative sine, as for all
-models. This module follows rs_driver. It is assumed that the integers of the IMU are big-endian,
-like all other integers. With dual return, the order of the blocks is assumed to be the order in
-rs_driver. Packets of models with 48 or 192 lasers (`lidar_model` 1 or 3) are not accepted.
+azimuth. In rs_driver, x is proportional to the cosine of the azimuth and y to its negative sine;
+rs_driver uses these axes for all models. This module follows rs_driver. It is assumed that the
+integers of the IMU are big-endian, like all other integers. With dual return, the order of the
+blocks is assumed to be the order in rs_driver. Packets of models with 48 or 192 lasers
+(`lidar_model` 1 or 3) are not accepted.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ from lidarspec_robosense.rotor import (
     FACTORY_SPEED_HZ,
     TEMPERATURE,
     TIME,
-    Rotor,
+    RotorModel,
     laser_degrees,
     make_angles,
     make_clock_status,
@@ -109,10 +110,10 @@ ELEVATION_DEG = np.array([  # Table 32
     74.33, 75.29, 76.24, 77.19, 78.14, 79.07, 80.02, 80.96, 81.9, 82.84, 83.78, 84.7, 85.64, 86.57, 87.52, 88.46, 89.4,
 ])
 # fmt: on
-ROTOR = Rotor(
+ROTOR = RotorModel(
     delay=UPRIGHT_DELAY_S,
     period=111.08e-6,
-    lens=float(np.hypot(0.0075, 0.00664)),
+    lens_distance=float(np.hypot(0.0075, 0.00664)),
     height=0.04532,
     vertical=ELEVATION_DEG,
 )
@@ -211,7 +212,7 @@ def points(f: Fields) -> Polar:
     difop = f.state.difop
     dual = f.returns == DUAL
     is_lower_half = f.blocks.index % 2 == 0
-    ahead = np.where(dual, following(azimuth, 4), following(azimuth, 2))
+    next_azimuth = np.where(dual, following(azimuth, 4), following(azimuth, 2))
     vertical = np.where(
         is_lower_half, laser_degrees(difop.vertical_low), laser_degrees(difop.vertical_high)
     )
@@ -228,7 +229,7 @@ def points(f: Fields) -> Polar:
         f.blocks.channels,
         ROTOR,
         (vertical, horizontal),
-        ahead,
+        next_azimuth,
         elapsed=delay,
         duration=ROTOR.period,
         shot=np.where(dual, block // 4, block // 2),

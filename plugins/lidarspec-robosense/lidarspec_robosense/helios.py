@@ -6,18 +6,22 @@ Source: RS-Helios-16P user manual: 5.4.2 (return modes), 6.2 and Table 9 (MSOP),
 (DIFOP), appendix B.3 to B.13 (registers). From the vendor's rs_driver (decoder_RSHELIOS.hpp,
 decoder_RSHELIOS_16P.hpp): coordinates, optical centre, temperature, offset of the horizontal
 angles, the times of 32 lasers. From nebula's former decoder: the firing times of the 16P, which
-reproduce the azimuths in nebula's published point clouds to the last digit.
+reproduce the azimuths in nebula's published point clouds to the last digit. The manual of another
+model, the Helios-1610, was compared with these sources.
 
 The manual has errors. The distance in its example, 320 steps of 0.25 cm, is 0.8 m and not 8 m. In
 its examples of angles, the vertical angle 00 05 d6 is 14.94 degrees and not 14.95, and the
-horizontal angle 01 01 96 is -4.06 degrees. The second part of a time is in nanoseconds in appendix
-B.13, but in microseconds in Table 9 and the capture. The type is at byte 31 in the manual of the
-Helios-1610, but at byte 30 in rs_driver and the capture. In rs_driver, the second firing of a 16P
-is 27.68 us after the first; the azimuths in the manual require 55.56 us. The firing times of 32
-lasers are from rs_driver, 1.73 us apart; nebula has other times, up to 48 us.
+horizontal angle 01 01 96 is -4.06 degrees.
 
-The published capture with the name of the 16P is of a Helios-5515: its packets have type 6, and its
-DIFOP has 32 different angles with single return.
+The sources disagree in four places. The second part of a time is in microseconds in Table 9 and in
+nebula's capture; in appendix B.13 it is in nanoseconds. The type is at byte 30 in rs_driver and in
+the capture; in the manual of the Helios-1610 it is at byte 31. The second firing of a 16P is
+55.56 us after the first according to the azimuths in the manual; in rs_driver it is 27.68 us. The
+firing times of 32 lasers are 1.73 us apart in rs_driver; nebula has other times, up to 48 us. Each
+time, this module follows the source that is named first.
+
+Nebula's capture has the name of the 16P, but was recorded with a Helios-5515: its packets have type
+6, and its DIFOP has 32 different angles and a return mode that means single return.
 """
 
 from __future__ import annotations
@@ -42,7 +46,7 @@ from lidarspec_robosense.rotor import (
     TEMPERATURE,
     TIME,
     WAVE_MODES,
-    Rotor,
+    RotorModel,
     laser_angles,
     make_angles,
     make_blocks,
@@ -87,24 +91,24 @@ ELEVATION_5515_DEG = (
     *(-10, -16, -13, -19, -22, -28, -25, -31, -34, -37, -40, -43, -46, -49, -52, -55),
 )
 
-HELIOS_16P_ROTOR = Rotor(
+HELIOS_16P_ROTOR = RotorModel(
     delay=np.array(TIMES_16P_US) * 1e-6,
     period=FIRING_PERIOD_S,
-    lens=0.03498,
+    lens_distance=0.03498,
     # assumed: the topmost laser first, 2 degrees apart over the model's 30 degrees
     vertical=15.0 - 2 * np.arange(16),
 )
-HELIOS_5515_ROTOR = Rotor(
+HELIOS_5515_ROTOR = RotorModel(
     delay=np.arange(LASERS) * 1.73e-6,
     period=FIRING_PERIOD_S,
-    lens=0.03498,
+    lens_distance=0.03498,
     vertical=np.array(ELEVATION_5515_DEG),
 )
 # assumed: the topmost laser first, 1 degree apart over the model's 31 degrees
 HELIOS_32_ROTOR = dataclasses.replace(HELIOS_5515_ROTOR, vertical=15.0 - np.arange(LASERS))
 
 
-def make_packet(rows: Construct) -> Struct:
+def make_packet_struct(blocks: Construct) -> Struct:
     """Return the struct of a data packet with these blocks."""
     return Struct(
         "header" / Const(b"\x55\xaa\x05\x5a"),
@@ -112,7 +116,7 @@ def make_packet(rows: Construct) -> Struct:
         "reserved_6" / Bytes(2),
         "top_packet_count"
         / Bytes(4)
-        * "four one-byte counters; each counter is 3 higher than the previous counter",
+        * "four one-byte counters; in a packet, each counter is 3 higher than the one before it",
         "bottom_packet_count" / Int32ub * "packet counter",
         "reserved_16" / Bytes(1),
         "range_resolution" / Enum(Int8ub, **{"5 mm": 0, "2.5 mm": 1}),
@@ -122,7 +126,7 @@ def make_packet(rows: Construct) -> Struct:
         "reserved_31" / Bytes(7),
         "temperature" / TEMPERATURE,
         "reserved_40" / Bytes(2),
-        "blocks" / rows,
+        "blocks" / blocks,
         "tail" / Bytes(6) * "reserved bytes, then 00 FF",
     )
 
@@ -172,7 +176,7 @@ def points_16p(f: Fields) -> Polar:
     return dataclasses.replace(polar, range=scale_range(f, polar), ring=np.arange(16))
 
 
-def points_32(f: Fields, model: Rotor) -> Polar:
+def points_32(f: Fields, model: RotorModel) -> Polar:
     """Return the points of blocks with one firing."""
     polar = points_of_firings(f, f.state.difop.return_mode == DUAL, model)
     return dataclasses.replace(polar, range=scale_range(f, polar))
@@ -183,19 +187,22 @@ def scale_range(f: Fields, polar: Polar) -> Any:
     return polar.range * np.where(f.range_resolution == 0, 2, 1)
 
 
-def sweep_data(i: int, shots: float, lidar_type: int) -> dict[str, Any]:
-    """Return the values of simulated packet i, with `shots` firings per block."""
+def sweep_data(i: int, firings: float, lidar_type: int) -> dict[str, Any]:
+    """Return the values of simulated packet i, with `firings` firings per block."""
     counts = {"protocol_version": 1, "bottom_packet_count": i % (1 << 32), "range_resolution": 1}
-    return rotation_values(i, BLOCKS, shots * FIRING_PERIOD_S, lidar_type=lidar_type, **counts)
+    return rotation_values(i, BLOCKS, firings * FIRING_PERIOD_S, lidar_type=lidar_type, **counts)
 
 
 def has_block_pairs(f: Fields) -> Any:
-    """Return whether both blocks of a pair have the same azimuth, as with two returns."""
+    """Return whether the first two blocks have the same azimuth, as with dual return."""
     return f.blocks[0].azimuth == f.blocks[1].azimuth
 
 
 def has_equal_halves(f: Fields) -> Any:
-    """Return whether the halves of most blocks are equal."""
+    """Return whether the distances in the two halves of the blocks are mostly equal.
+
+    With dual return, the halves of a 16P's block are the two returns of one firing.
+    """
     distance = np.asarray(f.blocks.channels.distance)
     first = distance[..., :16]
     second = distance[..., 16:]
@@ -204,7 +211,7 @@ def has_equal_halves(f: Fields) -> Any:
 
 DIFOP_SIMULATION = Simulation(partial(sweep_difop, speed="measured_rpm"), rate=1)
 DATA_FRAME_32 = Frame(
-    make_packet(make_blocks(BLOCKS, LASERS, 0.0025)), data=True, plausible=plausible
+    make_packet_struct(make_blocks(BLOCKS, LASERS, 0.0025)), data=True, plausible=plausible
 )
 DIFOP_FRAME_32 = Frame(DIFOP_32, simulation=DIFOP_SIMULATION)
 MODEL_5515 = Relative("type 6, Helios-5515", lambda f: f.lidar_type == TYPE_5515)
@@ -215,14 +222,16 @@ HELIOS_16P = Sensor(
     model="RS-Helios-16P",
     frames={
         "data": Frame(
-            make_packet(make_blocks(BLOCKS, 16, 0.0025, firings=2)), data=True, plausible=plausible
+            make_packet_struct(make_blocks(BLOCKS, 16, 0.0025, firings=2)),
+            data=True,
+            plausible=plausible,
         ),
         "difop": Frame(DIFOP_16, simulation=DIFOP_SIMULATION),
     },  # 600 and 1200 rpm (manual B.1)
     points=points_16p,
     sequence=PacketCounter("bottom_packet_count"),
     state=HELIOS_16P_ROTOR.make_default_state(return_mode=STRONGEST),
-    simulation=Simulation(partial(sweep_data, shots=2, lidar_type=TYPE_1615)),
+    simulation=Simulation(partial(sweep_data, firings=2, lidar_type=TYPE_1615)),
     range_limits=(0.1, 180.0),  # rs_driver's limits for this model
     # firmware: that of the first of three boards in Table 11; no temperature, because its sign is
     # in a separate field
@@ -234,7 +243,8 @@ HELIOS_16P = Sensor(
     relatives={
         "robosense-helios5515": MODEL_5515,
         "robosense-helios32": Relative(
-            "pairs of blocks have the same azimuth, or one packet arrives every 0.67 ms",
+            "with dual return, the two blocks of a pair have the same azimuth; with single return,"
+            " a packet arrives every 0.67 ms",
             has_block_pairs,
         ),
     },
@@ -257,12 +267,13 @@ HELIOS_32 = dataclasses.replace(
     frames={"data": DATA_FRAME_32, "difop": DIFOP_FRAME_32},
     points=partial(points_32, model=HELIOS_32_ROTOR),
     state=HELIOS_32_ROTOR.make_default_state(return_mode=STRONGEST),
-    simulation=Simulation(partial(sweep_data, shots=1, lidar_type=TYPE_1615)),
+    simulation=Simulation(partial(sweep_data, firings=1, lidar_type=TYPE_1615)),
     turn=SPEED_LIMITS_HZ,  # 300, 600 and 1200 rpm (Helios 32 product manual)
     relatives={
         "robosense-helios5515": MODEL_5515,
         "robosense-helios16p": Relative(
-            "either both halves of a block are equal, or one packet arrives every 1.33 ms",
+            "with dual return, the two halves of a block are equal; with single return, a packet"
+            " arrives every 1.33 ms",
             has_equal_halves,
         ),
     },
@@ -279,7 +290,7 @@ HELIOS_5515 = dataclasses.replace(
     model="RS-Helios-5515",
     points=partial(points_32, model=HELIOS_5515_ROTOR),
     state=HELIOS_5515_ROTOR.make_default_state(return_mode=STRONGEST),
-    simulation=Simulation(partial(sweep_data, shots=1, lidar_type=TYPE_5515)),
+    simulation=Simulation(partial(sweep_data, firings=1, lidar_type=TYPE_5515)),
     relatives={"robosense-helios16p": NOT_5515, "robosense-helios32": NOT_5515},
     status="capture",
     source=(

@@ -6,9 +6,10 @@ model.
 Source: RS-LiDAR-M1 user guide, 2.1.2 and Table 5 (the data blocks); RS-LiDAR-M1P user guide, pages
 9 to 14 (header, tail, formulas, worked example), with which the vendor's rs_driver agrees.
 
-Known errors and gaps of the guides: The time of a group of points is printed as "titime_offset"; it
-is the packet's timestamp plus time_offset. The offset 32768 of the angles is only on the next page
-of the M1P guide. In the worked example, z is printed as 2.17, but is 2.1647. The formula raw - 80
+Known errors and gaps of the guides: The formula for the time of a group of points is misprinted
+("titime_offset"); the time is the packet's timestamp plus time_offset. The angles have an offset of
+32768, which the M1P guide does not mention in its table, but on the page after the table. In the
+worked example, z is printed as 2.17, but is 2.1647. The formula raw - 80
 for mems_tmp gives -46 degC for the guide's own capture, so the raw byte is kept unless the option
 `firmware` selects a formula. The 750 000 points per second in the guide do not agree with 630
 packets in a frame, which result in 787 500 points.
@@ -172,8 +173,10 @@ def plausible(f: Fields) -> Any:
     return f.pkt_psn >= 1
 
 
-def count_returns(f: Fields) -> Any:
-    """Return the number of consecutive packets with the returns of the same firings.
+def count_packets_per_firing(f: Fields) -> Any:
+    """Return how many consecutive packets contain returns of the same firings.
+
+    The number is 2 with dual return, and 1 with single return.
 
     Source: M1 user guide, 2.1.2.
     """
@@ -182,17 +185,17 @@ def count_returns(f: Fields) -> Any:
 
 def packets_per_frame(f: Fields) -> Any:
     """Return the number of packets in a frame, which is the highest packet number."""
-    return SINGLE_RETURN_PACKETS * count_returns(f)
+    return SINGLE_RETURN_PACKETS * count_packets_per_firing(f)
 
 
 def number_firings(f: Fields, blocks: int) -> Any:
     """Return the number of each block's firing, counted from the start of the frame."""
-    group = np.floor((f.pkt_psn - 1) / count_returns(f))
+    group = np.floor((f.pkt_psn - 1) / count_packets_per_firing(f))
     return group * blocks + f.blocks.index
 
 
 def pace(f: Fields) -> Any:
-    """Return the seconds from a packet to the next."""
+    """Return the time from one packet to the next, in seconds."""
     return 1 / (FRAME_RATE_HZ * packets_per_frame(f))
 
 
@@ -218,10 +221,10 @@ def points(f: Fields) -> Polar:
 def simulated_angles(number: int) -> tuple[Any, Any]:
     """Return elevation and azimuth in degrees, (25, 5), of a simulated packet.
 
-    `number` is the number of the packet in its frame, from 0, with single return.
+    `number` is the position of the packet in a frame with single return, counted from 0.
 
     Source: the field of view, the number of packets and the directions of the channels are from the
-    guide; the lines are assumed.
+    guide; the pattern of the scan lines is assumed.
     """
     line, firing = np.divmod(number * BLOCKS + np.arange(BLOCKS), SIMULATED_LINE_FIRINGS)
     across = (firing + 0.5) / SIMULATED_LINE_FIRINGS - 0.5
@@ -335,7 +338,10 @@ def configure(
 
 
 def make_reported(field: str, text: Callable[[Any], str] | None = None) -> Reported:
-    """Return the declaration of a fact that all known layouts of DIFOP contain."""
+    """Return the `Reported` value of a field that all known layouts of DIFOP contain.
+
+    `text` is a function that returns the value as text; by default, the value is unchanged.
+    """
     return Reported(*(f"{name}.{field}" for name in LAYOUTS), text=text)
 
 
@@ -372,7 +378,9 @@ M1 = Sensor(
     links={"data": Udp(6699, 7788)},
     # the time of the grandmaster as it is (issue rslidar_sdk 169), in PTP's own scale TAI
     clock=Clock(("seconds", "microseconds"), pace=pace, epoch="tai", status=make_clock_status()),
-    sequence=PacketCounter("pkt_psn", first=1, last=packets_per_frame, returns=count_returns),
+    sequence=PacketCounter(
+        "pkt_psn", first=1, last=packets_per_frame, returns=count_packets_per_firing
+    ),
     returns=("first", "last"),  # the nearer and the farther return (M1 user guide, Table 5)
     simulation=Simulation(sweep),
     range_limits=(0.2, 200.0),  # rs_driver's limits for this model

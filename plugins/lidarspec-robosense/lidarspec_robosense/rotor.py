@@ -9,8 +9,13 @@ Source: the vendor's rs_driver (decoder.hpp, decoder_mech.hpp, block_iterator.hp
 geometry, time, gaps); RS-Helios-16P user manual, Table 11 and appendix B (fields of the second
 layout); Airy manual, Table 8 (one DIFOP packet a second, assumed for the other models).
 
-If a field of view is configured, there is a gap between two blocks of a packet. The times of the
-points after the gap are too early, and are not corrected.
+In a firing, each laser fires once. A shot comprises all firings between one azimuth and the next:
+one firing, or two if a block contains two firings. A slot is the position of a laser's values in a
+block.
+
+If the user has limited the field of view, the sensor sends no blocks outside it, so in some packets
+the azimuth jumps between two blocks. The times of the points after the jump are too early, and are
+not corrected.
 """
 
 from __future__ import annotations
@@ -83,9 +88,11 @@ def make_blocks(
     """Return the array of blocks; a block has one azimuth.
 
     Args:
-        lasers: the number of channels of a firing.
+        count: the number of blocks.
+        lasers: the number of lasers.
         step: the size of a distance step in metres.
-        firings: the number of groups of channels in a block, 1 or 2.
+        firings: how often a block contains each laser, 1 or 2.
+        flag: the declaration of the bytes at the start of a block.
     """
     channel = Struct("distance" / Scaled(Int16ub, step, "m") * "0: no return", "intensity" / Int8ub)
     channels: Construct = "channels" / Array(lasers, channel)
@@ -105,7 +112,7 @@ def make_blocks(
 def make_angles(lasers: int, step: float = 0.01) -> Construct:
     """Return the array with the angle of each laser, as a sign and a magnitude.
 
-    `step` is the size of a raw step of the magnitude in degrees.
+    `step` is the angle in degrees for which one unit of the raw magnitude stands.
     """
     sign = Enum(Int8ub, positive=0, negative=1, not_calibrated=255)
     return Array(lasers, Struct("sign" / sign, "value" / Scaled(Int16ub, step, "deg")))
@@ -123,7 +130,7 @@ SOURCES = ("internal clock", "PPS", "PTP", "gPTP")
 
 
 def make_clock_status(sources: Sequence[str] = SOURCES) -> ClockStatus:
-    """Return how the state of the clock is read from DIFOP.
+    """Return the declaration that reads the state of the clock from DIFOP.
 
     `sources` has the name of the time source for each mode of synchronization.
 
@@ -218,14 +225,15 @@ def make_first_layout(*end: Construct) -> Construct:
 
 
 @dataclass(frozen=True, eq=False)
-class Rotor:
+class RotorModel:
     """The firing times, geometry and nominal angles of a model.
 
     Attributes:
         delay: the seconds from the time of the block to the firing of each laser, (slots,), or
             (blocks, slots) if blocks contain different lasers.
         period: the seconds from one firing of all lasers to the next.
-        lens: the distance from the axis to the optical centre in the rotor's direction, metres.
+        lens_distance: the distance in metres from the axis to the optical centre, in the direction
+            of the rotor.
         vertical, horizontal: (lasers,) the nominal angles in degrees, which are used until DIFOP
             with the angles of the unit arrives.
         height: the height of the optical centre above the origin, metres.
@@ -233,7 +241,7 @@ class Rotor:
 
     delay: NDArray[Any]
     period: float
-    lens: float
+    lens_distance: float
     vertical: NDArray[Any]
     horizontal: NDArray[Any] | None = None
     height: float = 0.0
@@ -277,39 +285,47 @@ def laser_angles(f: Fields) -> tuple[Any, Any]:
     return laser_degrees(f.state.difop.vertical), laser_degrees(f.state.difop.horizontal)
 
 
-def points_of_firings(f: Fields, dual: Any, model: Rotor, *, late: Any = 0) -> Polar:
-    """Return the points of blocks with one firing of all lasers.
+def points_of_firings(f: Fields, dual: Any, model: RotorModel, *, first_echo: Any = 0) -> Polar:
+    """Return the points of blocks that contain each laser once.
 
-    `late` is 1 if the first block of the packet is the second block of a firing, else 0.
+    With `dual`, two consecutive blocks contain the two returns of one firing. `first_echo` is the
+    number of the return in the first block of the packet: 0, or 1 if the block with the other
+    return is in the previous packet.
     """
     azimuth = f.blocks.azimuth
     block = f.blocks.index
-    ahead = np.where(dual, following(azimuth, 2), following(azimuth))
-    shot = np.where(dual, (block + late) // 2, block)
-    echo = np.where(dual, (block + late) % 2, 0)
+    next_azimuth = np.where(dual, following(azimuth, 2), following(azimuth))
+    shot = np.where(dual, (block + first_echo) // 2, block)
+    echo = np.where(dual, (block + first_echo) % 2, 0)
     times = {"elapsed": model.delay, "duration": model.period, "shot": shot}
-    return make_points(f, f.blocks.channels, model, laser_angles(f), ahead, echo=echo, **times)
+    return make_points(
+        f, f.blocks.channels, model, laser_angles(f), next_azimuth, echo=echo, **times
+    )
 
 
-def points_of_groups(f: Fields, dual: Any, model: Rotor, lasers: tuple[Any, Any]) -> Polar:
-    """Return the points of blocks with two groups of all lasers."""
+def points_of_groups(f: Fields, dual: Any, model: RotorModel, angles: tuple[Any, Any]) -> Polar:
+    """Return the points of blocks with two groups, each of which contains each laser once.
+
+    With `dual`, the groups are the two returns of one firing; otherwise they are two firings.
+    `angles` has the elevation and the horizontal angle of each laser, as in `make_points`.
+    """
     group = np.arange(2)[:, None]
     duration = np.where(dual, 1, 2) * model.period
     elapsed = np.where(dual, 0, group) * model.period + model.delay
-    ahead = following(f.blocks.azimuth)
+    next_azimuth = following(f.blocks.azimuth)
     echo = np.where(dual, group, 0)
     channels = f.blocks.groups.channels
     shot = f.blocks.index
     times = {"elapsed": elapsed, "duration": duration, "shot": shot}
-    return make_points(f, channels, model, lasers, ahead, echo=echo, **times)
+    return make_points(f, channels, model, angles, next_azimuth, echo=echo, **times)
 
 
 def make_points(
     f: Fields,
     channels: Any,
-    model: Rotor,
-    lasers: tuple[Any, Any],
-    ahead: Any,
+    model: RotorModel,
+    angles: tuple[Any, Any],
+    next_azimuth: Any,
     *,
     elapsed: Any,
     duration: Any,
@@ -323,18 +339,19 @@ def make_points(
     Source: rs_driver, internDecodeMsopPkt.
 
     Args:
-        lasers: the elevation of each laser, and its angle clockwise from the rotor's direction, in
+        angles: the elevation of each laser, and its angle clockwise from the rotor's direction, in
             degrees.
-        ahead: azimuth of the next shot, degrees.
-        elapsed: the seconds from the moment of a shot's azimuth to the firing of each laser.
+        next_azimuth: the azimuth of the next shot, for each block, in degrees.
+        elapsed: the seconds from the time at which the rotor has the azimuth of the shot to the
+            firing of each laser.
         duration: the seconds from shot to shot.
         shot: the number of the shot in the packet, for each block.
         echo: the number of the return, for each block.
         distance: the distances in metres; by default the field `distance` of the channels.
         ring: the numbers of the lasers; by default in the order of their elevations.
     """
-    vertical, horizontal = lasers
-    step = between_blocks(f.blocks.azimuth, ahead, fastest=MAX_SPEED_DEG_S * duration)
+    vertical, horizontal = angles
+    step = between_blocks(f.blocks.azimuth, next_azimuth, fastest=MAX_SPEED_DEG_S * duration)
     step = np.where(np.isnan(step), f.state.difop.rpm * 6 * duration, step)
     clockwise = np.deg2rad(f.blocks.azimuth + step * elapsed / duration)
     return Polar(
@@ -345,27 +362,32 @@ def make_points(
         time=shot * duration + elapsed,
         ring=model.ring if ring is None else ring,
         return_index=echo,
-        origin=(model.lens * np.cos(clockwise), -model.lens * np.sin(clockwise), model.height),
+        origin=(
+            model.lens_distance * np.cos(clockwise),
+            -model.lens_distance * np.sin(clockwise),
+            model.height,
+        ),
     )
 
 
-def pace(f: Fields, shots: float, period: float, dual: int) -> Any:
-    """Return the seconds from a packet to the next.
+def pace(f: Fields, firings: float, period: float, dual: int) -> Any:
+    """Return the time from one packet to the next, in seconds.
 
     Args:
-        shots: the number of shots of a packet with single return.
-        period: the seconds from shot to shot.
+        firings: the number of firings in a packet with single return.
+        period: the seconds from one firing to the next.
         dual: the return mode in DIFOP that means dual return.
     """
-    return np.where(f.state.difop.return_mode == dual, shots / 2, shots) * period
+    return np.where(f.state.difop.return_mode == dual, firings / 2, firings) * period
 
 
 def rotation_values(i: int, shots: int, period: float, **others: Any) -> dict[str, Any]:
-    """Return the values of simulated packet i with single return.
+    """Return the time and the azimuths of simulated packet i with single return.
 
     Args:
-        shots: shots per packet.
-        period: seconds from shot to shot.
+        shots: the number of shots in a packet.
+        period: the seconds from shot to shot.
+        others: the values of other fields, which are added to the result.
     """
     time = i * shots * period
     azimuth = np.round((i * shots + np.arange(shots)) * period * FACTORY_SPEED_HZ * 360, 2) % 360

@@ -5,8 +5,8 @@ The DIFOP packets have the first layout that the module `rotor` describes.
 Source: the vendor's rs_driver (decoder_RS16.hpp, decoder_RS32.hpp, decoder_RSBP.hpp and their
 tests: layouts, firing times, optical centre, return modes, time); ros_rslidar (the angles of an
 example unit of each model). This module reads the date of a packet as UTC, but rs_driver reads it
-as the local time of the computer. In rs_driver's test of the RS-LiDAR-16, angles have steps of
-0.0001 degrees.
+as the local time of the computer. The angles in the DIFOP of an RS-LiDAR-16 have steps of 0.0001
+degrees, as in rs_driver's test.
 
 As in rs_driver, it is assumed that the type in byte 30 is 1 only in packets of an RS-LiDAR-16, and
 2 only in packets of an RS-LiDAR-32. It is also assumed that bytes 31 and 32 identify a Bpearl of
@@ -28,7 +28,7 @@ from lidarspec_robosense.rotor import (
     FACTORY_SPEED_HZ,
     TEMPERATURE,
     TIME,
-    Rotor,
+    RotorModel,
     make_angles,
     make_blocks,
     make_first_layout,
@@ -62,10 +62,13 @@ RS32_HORIZONTAL = (
 )
 # fmt: on
 
-RS16_ROTOR = Rotor(
-    delay=np.arange(16) * 2.8e-6, period=55.5e-6, lens=0.03825, vertical=np.array(RS16_VERTICAL)
+RS16_ROTOR = RotorModel(
+    delay=np.arange(16) * 2.8e-6,
+    period=55.5e-6,
+    lens_distance=0.03825,
+    vertical=np.array(RS16_VERTICAL),
 )
-RS32_ROTOR = Rotor(
+RS32_ROTOR = RotorModel(
     # 2.88 us apart in two rows, the second 1.44 us after the first; the last laser of a row fires
     # 1.44 us later still (rs_driver)
     delay=(
@@ -73,11 +76,11 @@ RS32_ROTOR = Rotor(
     )
     * 1e-6,
     period=55.52e-6,
-    lens=0.03997,
+    lens_distance=0.03997,
     vertical=np.array(RS32_VERTICAL),
     horizontal=np.array(RS32_HORIZONTAL),
 )
-BPEARL_ROTOR = Rotor(
+BPEARL_ROTOR = RotorModel(
     # 2.56 us apart in two rows, the second 1.28 us after the first, each with a pause in its middle
     # (rs_driver)
     delay=(
@@ -85,7 +88,7 @@ BPEARL_ROTOR = Rotor(
     )
     * 1e-6,
     period=55.52e-6,
-    lens=0.01473,
+    lens_distance=0.01473,
     height=0.09427,
     vertical=np.round(89.5 - 2.8125 * SLOT_INDEX, 2),  # in the steps of its DIFOP
 )
@@ -94,7 +97,7 @@ BPEARL_V4_ROTOR = dataclasses.replace(
     BPEARL_ROTOR,
     delay=np.round(SLOT_INDEX * 1.668, 2) * 1e-6,
     period=55.56e-6,
-    lens=0.01619,
+    lens_distance=0.01619,
     height=0.09571,
 )
 
@@ -110,7 +113,7 @@ DATE: tuple[Construct, ...] = (
 )
 
 
-def make_packet(time: tuple[Construct, ...], rows: Construct) -> Struct:
+def make_packet_struct(time: tuple[Construct, ...], blocks: Construct) -> Struct:
     """Return the struct of a data packet with this time and these blocks."""
     return Struct(
         "header" / Const(b"\x55\xaa\x05\x0a\x5a\xa5\x50\xa0"),
@@ -122,7 +125,7 @@ def make_packet(time: tuple[Construct, ...], rows: Construct) -> Struct:
         "reserved_33" / Bytes(5),
         "temperature" / TEMPERATURE,
         "reserved_40" / Bytes(2),
-        "blocks" / rows,
+        "blocks" / blocks,
         "index" / Bytes(4),
         "tail" / Const(b"\x00\xff"),
     )
@@ -144,7 +147,7 @@ DIFOP_16 = make_first_layout(
     "reserved_468" / Bytes(697),
     "pitch"
     / Array(16, Scaled(Int24ub, 0.0001, "deg"))
-    * "absolute vertical angles; the first eight lasers point below the horizon",
+    * "vertical angles without their sign; the first eight lasers point below the horizon",
     "reserved_1213" / Bytes(33),
 )
 
@@ -167,15 +170,18 @@ def is_plausible_bpearl(f: Fields, v4: bool) -> Any:
     )
 
 
-def clock(f: Fields) -> tuple[Any, Any, Any]:
-    """Return the whole seconds since 1970, the milliseconds and the microseconds."""
+def read_time(f: Fields) -> tuple[Any, Any, Any]:
+    """Return the whole seconds since 1970, and the fields with milliseconds and microseconds."""
     date = unix_time(f.year + 2000, f.month, f.day, f.hour, f.minute, f.second)
     return date, f.milliseconds, f.microseconds
 
 
-def make_clock(source: Any, shots: int, model: Rotor) -> Clock:
-    """Return the clock of packets with `shots` firings of all lasers."""
-    pace_of_mode = partial(pace, shots=shots, period=model.period, dual=DUAL)
+def make_clock(source: Any, firings: int, model: RotorModel) -> Clock:
+    """Return the declared clock of a sensor with `firings` firings in a packet.
+
+    `source` has the names of the fields with the time, or is a function that returns the time.
+    """
+    pace_of_mode = partial(pace, firings=firings, period=model.period, dual=DUAL)
     # set by PPS and GPRMC, whose time is UTC; whether it is set is not reported
     return Clock(source, pace=pace_of_mode, epoch="utc")
 
@@ -186,7 +192,7 @@ def points_16(f: Fields) -> Polar:
     return points_of_groups(f, f.state.difop.return_mode == DUAL, RS16_ROTOR, (up, 0.0))
 
 
-def points(f: Fields, model: Rotor) -> Polar:
+def points(f: Fields, model: RotorModel) -> Polar:
     """Return the points of blocks with one firing."""
     return points_of_firings(f, f.state.difop.return_mode == DUAL, model)
 
@@ -222,7 +228,7 @@ RS32 = Sensor(
     model="RS-LiDAR-32",
     frames={
         "data": Frame(
-            make_packet(DATE, make_blocks(BLOCKS, LASERS, 0.005)),
+            make_packet_struct(DATE, make_blocks(BLOCKS, LASERS, 0.005)),
             data=True,
             plausible=partial(is_plausible, lidar_type=RS32_TYPE),
         ),
@@ -238,7 +244,7 @@ RS32 = Sensor(
         "model": "data.lidar_type",
     },
     source="rs_driver (decoder_RS32.hpp); angles of an example unit in ros_rslidar",
-    **{**COMMON, "clock": make_clock(clock, BLOCKS, RS32_ROTOR)},
+    **{**COMMON, "clock": make_clock(read_time, BLOCKS, RS32_ROTOR)},
 )
 
 RS16 = dataclasses.replace(
@@ -247,14 +253,14 @@ RS16 = dataclasses.replace(
     model="RS-LiDAR-16",
     frames={
         "data": Frame(
-            make_packet(DATE, make_blocks(BLOCKS, 16, 0.005, firings=2)),
+            make_packet_struct(DATE, make_blocks(BLOCKS, 16, 0.005, firings=2)),
             data=True,
             plausible=partial(is_plausible, lidar_type=RS16_TYPE),
         ),
         "difop": Frame(DIFOP_16, simulation=INFORMATION),
     },
     points=points_16,
-    clock=make_clock(clock, 2 * BLOCKS, RS16_ROTOR),
+    clock=make_clock(read_time, 2 * BLOCKS, RS16_ROTOR),
     state={
         "difop": {
             "rpm": FACTORY_SPEED_HZ * 60,
@@ -272,14 +278,14 @@ BPEARL = dataclasses.replace(
     model="RS-Bpearl",
     frames={
         "data": Frame(
-            make_packet(DATE, make_blocks(BLOCKS, LASERS, 0.005)),
+            make_packet_struct(DATE, make_blocks(BLOCKS, LASERS, 0.005)),
             data=True,
             plausible=partial(is_plausible_bpearl, v4=False),
         ),
         "difop": Frame(make_difop(0.01), simulation=INFORMATION),
     },
     points=partial(points, model=BPEARL_ROTOR),
-    clock=make_clock(clock, BLOCKS, BPEARL_ROTOR),
+    clock=make_clock(read_time, BLOCKS, BPEARL_ROTOR),
     state=BPEARL_ROTOR.make_default_state(return_mode=STRONGEST),
     simulation=Simulation(partial(sweep, block_us=55.52, lidar_type=0)),
     range_limits=(0.1, 150.0),  # rs_driver's limits for this model
@@ -293,7 +299,7 @@ BPEARL_V4 = dataclasses.replace(
     model="RS-Bpearl, version 4",
     frames={
         "data": Frame(
-            make_packet(TIME, make_blocks(BLOCKS, LASERS, 0.0025)),
+            make_packet_struct(TIME, make_blocks(BLOCKS, LASERS, 0.0025)),
             data=True,
             plausible=partial(is_plausible_bpearl, v4=True),
         ),

@@ -2,8 +2,9 @@
 
 The RS-Ruby models are RS-LiDAR-128, -80 and -48. The RS-Ruby Plus models have 128, 80 or 48 lasers;
 there are two models with 80 lasers, 80 and 80V. Both series send the same packets, which have 3, 4
-or 8 blocks; a block contains all lasers. With dual return, a shot has two blocks, so a packet of
-three blocks contains one and a half shots: A A B, and the next packet B C C.
+or 8 blocks; a block contains all lasers. With dual return, a firing has two blocks. A packet of
+three blocks then contains one and a half firings: if one packet contains the blocks A A B, the next
+packet contains the blocks B C C.
 
 Source: RS-Ruby Plus user manual, Table 5-2 to 5-5 (header, return modes, blocks), RS-Ruby user
 manual, Table 4; the vendor's rs_driver (decoder_RS128.hpp, decoder_RS80.hpp, decoder_RS48.hpp and
@@ -11,9 +12,10 @@ the RSP variants: firing times, optical centre, DIFOP).
 
 The sources disagree. Series and model are at bytes 31 and 32 in the manual, and at 30 and 31 in
 rs_driver, so both positions are read. In the manuals, the return mode is in every packet; rs_driver
-reads it from DIFOP, with other codes for each model. This module follows the manuals. Early units
-send the time in seconds and nanoseconds. According to the manual, with dual return the first value
-of a pair is the last return, and the second value is the strongest return.
+reads it from DIFOP, with other codes for each model. This module follows the manuals. Early units send the time in
+seconds and nanoseconds, but this module always reads seconds and microseconds. According to the
+manual, with dual return the first of two blocks contains the last returns, and the second block
+contains the strongest returns.
 
 No table of nominal angles was found. The angles are assumed to be evenly spaced over 40 degrees,
 with the lowest laser first. 40 degrees is the field of view in the data sheets for 128 and 80
@@ -42,7 +44,7 @@ from lidarspec_robosense.rotor import (
     DIFOP_VERSIONS,
     TEMPERATURE_BE,
     TIME,
-    Rotor,
+    RotorModel,
     make_angles,
     make_blocks,
     make_clock_status,
@@ -70,7 +72,7 @@ BLOCKS = {128: 3, 80: 4, 48: 8}
 END_BYTES = {128: 4, 80: 192, 48: 4}
 
 
-def make_packet(lasers: int) -> Struct:
+def make_packet_struct(lasers: int) -> Struct:
     """Return the struct of a data packet of a model with `lasers` lasers."""
     flag = Struct("mark" / Const(b"\xfe"), "return_id" / Int8ub)
     return Struct(
@@ -120,21 +122,26 @@ def is_plus(f: Fields) -> Any:
     return (f.series == PLUS_SERIES) | (f.type_30 == PLUS_SERIES)
 
 
-def points(f: Fields, model: Rotor, variant: NDArray[np.float64] | None = None) -> Polar:
+def points(f: Fields, model: RotorModel, variant: NDArray[np.float64] | None = None) -> Polar:
     """Return the points of a packet.
 
     `variant` contains the firing times of an 80V in seconds.
     """
-    late = np.where(f.blocks[0].azimuth == f.blocks[1].azimuth, 0, 1)
+    first_echo = np.where(f.blocks[0].azimuth == f.blocks[1].azimuth, 0, 1)
     if variant is not None:
         is_80v = np.where(f.series == PLUS_SERIES, f.model, f.series) == MODEL_80V
         model = dataclasses.replace(model, delay=np.where(is_80v, variant, model.delay))
-    return points_of_firings(f, f.wave_mode.returns == DUAL, model, late=late)
+    return points_of_firings(f, f.wave_mode.returns == DUAL, model, first_echo=first_echo)
 
 
-def pace(f: Fields, shots: int, period: float) -> Any:
-    """Return the seconds from a packet to the next."""
-    return np.where(f.wave_mode.returns == DUAL, shots / 2, shots) * period
+def pace(f: Fields, firings: int, period: float) -> Any:
+    """Return the time from one packet to the next, in seconds.
+
+    Args:
+        firings: the number of firings in a packet with single return.
+        period: the seconds from one firing to the next.
+    """
+    return np.where(f.wave_mode.returns == DUAL, firings / 2, firings) * period
 
 
 def firing_times(times: Any, counts: Any) -> NDArray[np.float64]:
@@ -148,26 +155,27 @@ def firing_times(times: Any, counts: Any) -> NDArray[np.float64]:
 
 
 def even_firing_times(*counts: int) -> NDArray[np.float64]:
-    """Return the firing time of each laser in seconds.
+    """Return the firing time of each laser in seconds, for models with evenly spaced times.
 
-    Lasers fire at 16 times, 3.236 us apart. `counts` has the number of lasers at each time: 16
-    numbers for the first group, and 16 for the second group. Source: rs_driver.
+    The lasers form two groups. Both groups fire at the same 16 times, which are 3.236 us apart.
+    `counts` has the number of lasers that fire at each time: 16 numbers for the first group, then
+    16 for the second group. Source: rs_driver.
     """
     return firing_times(np.tile(np.arange(16) * 3.236, 2), counts)
 
 
-def make_rotor(delay: NDArray[np.float64], period: float, lens: float) -> Rotor:
-    """Return the rotor of a model, with evenly spaced nominal angles.
+def make_rotor(delay: NDArray[np.float64], period: float, lens_distance: float) -> RotorModel:
+    """Return the `RotorModel` of a model with evenly spaced nominal angles.
 
     Args:
         delay: the firing times of the lasers in seconds.
         period: the seconds from one firing of all lasers to the next.
-        lens: the distance from the axis to the optical centre, metres.
+        lens_distance: the distance from the axis to the optical centre, metres.
     """
-    return Rotor(
+    return RotorModel(
         delay=delay,
         period=period,
-        lens=lens,
+        lens_distance=lens_distance,
         vertical=np.round(np.linspace(-25, 15, len(delay)), 2),
     )
 
@@ -188,14 +196,14 @@ COUNTS_80 = (4, 4, 2, 3, 2, 2, 2, 2, 2, 2, 2, 2, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 2
 
 FRAMES = {
     lasers: {
-        "data": Frame(make_packet(lasers), data=True, plausible=plausible),
+        "data": Frame(make_packet_struct(lasers), data=True, plausible=plausible),
         "difop": Frame(make_difop(lasers), simulation=Simulation(sweep_difop, rate=1)),
     }
     for lasers in BLOCKS
 }
 
 
-def make_model(id: str, name: str, rotor: Rotor, relative: str, variant: Any = None) -> Sensor:
+def make_model(id: str, name: str, rotor: RotorModel, relative: str, variant: Any = None) -> Sensor:
     """Return the sensor of a Ruby or Ruby Plus; the id of a Ruby Plus contains "plus".
 
     Args:
@@ -237,7 +245,7 @@ def make_model(id: str, name: str, rotor: Rotor, relative: str, variant: Any = N
             **COMMON,
             "clock": Clock(
                 ("seconds", "microseconds"),
-                pace=partial(pace, shots=BLOCKS[lasers], period=rotor.period),
+                pace=partial(pace, firings=BLOCKS[lasers], period=rotor.period),
                 epoch="utc",  # as in `COMMON`
                 status=make_clock_status(),
             ),

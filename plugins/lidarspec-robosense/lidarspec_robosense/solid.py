@@ -4,9 +4,10 @@ Each point has a radius and a unit vector. Source: the vendor's rs_driver (decod
 decoder_RSMX.hpp, decoder_RSE1.hpp: packets, packets per frame, limits); E1 user manual, Tables 4 to
 9 (packets, tail, DIFOP).
 
-In the manual of the E1, packets are counted from 0, and the return modes 9 to 11 mean dual return;
-in rs_driver, the mode 0 means dual return. The CRCs at the end of packets are not verified, because
-the bytes that they cover are not public; the CRC of the E1 is called AUTOSAR E2E profile 4. It is
+For the E1, this module follows the manual, in which packets are counted from 0 and the return modes
+9 to 11 mean dual return; in rs_driver, the mode 0 means dual return. The CRCs at the end of packets
+are not verified, because the bytes that they cover are not public; the CRC of the E1 is called
+AUTOSAR E2E profile 4. It is
 assumed that the M2 and the MX count packets from 1, as the M1 does. It is also assumed that frames
 with dual return have twice as many packets, except for the MX, whose points have two radii. The IMU
 of the E1 is assumed to measure in g and rad/s like the IMU of the Airy, because rs_driver reads
@@ -46,7 +47,13 @@ from lidarspec.spec import (
     Simulation,
     stack,
 )
-from lidarspec_robosense.m1 import FRAME_RATE_HZ, HEADER, M1, count_returns, number_firings
+from lidarspec_robosense.m1 import (
+    FRAME_RATE_HZ,
+    HEADER,
+    M1,
+    count_packets_per_firing,
+    number_firings,
+)
 from lidarspec_robosense.rotor import RETURN_NUMBERS, TIME, WAVE_MODES, make_clock_status
 
 # return modes
@@ -60,14 +67,14 @@ LARGEST_COMPONENT = 32767 / 32768
 
 
 @dataclass(frozen=True)
-class Scanner:
-    """The packets and the field of view of a model.
+class SolidStateModel:
+    """The size of the packets and frames of a model, and its field of view.
 
     Attributes:
         blocks: the number of blocks per packet.
         channels: the number of channels per block.
         packets: the number of packets per frame with single return.
-        first: the number of the first packet of a frame.
+        first: the packet number of the first packet of a frame.
         width_deg, height_deg: the width and height of the simulated field of view.
     """
 
@@ -79,14 +86,14 @@ class Scanner:
     height_deg: float
 
 
-def make_packet(
-    model: Scanner,
+def make_packet_struct(
+    model: SolidStateModel,
     offset: Construct,
     parts: tuple[Construct, ...],
     channel: tuple[Construct, ...],
     *tail: Construct,
 ) -> Struct:
-    """Return the struct of a packet.
+    """Return the struct of a data packet.
 
     Args:
         offset: the type of a block's time offset.
@@ -119,15 +126,15 @@ RETURN_NUMBER = "return_seq" / Enum(Int8ub, **RETURN_NUMBERS)
 UNCHECKED_NOTE = "not checked: the covered bytes are not documented"
 CRC_AND_COUNTER = ("crc" / Int32ub * UNCHECKED_NOTE, "rolling_counter" / Int16ub)
 
-M2_SCANNER = Scanner(25, 5, 1260, 1, width_deg=120, height_deg=25)
-MX_SCANNER = Scanner(50, 2, 630, 1, width_deg=120, height_deg=25)
-E1_SCANNER = Scanner(96, 1, 288, 0, width_deg=120, height_deg=90)
+M2_MODEL = SolidStateModel(25, 5, 1260, 1, width_deg=120, height_deg=25)
+MX_MODEL = SolidStateModel(50, 2, 630, 1, width_deg=120, height_deg=25)
+E1_MODEL = SolidStateModel(96, 1, 288, 0, width_deg=120, height_deg=90)
 
-M2_DATA = make_packet(
-    M2_SCANNER, Int8ub, (RETURN_NUMBER,), ONE_RETURN, "reserved_end" / Bytes(4), *CRC_AND_COUNTER
+M2_DATA = make_packet_struct(
+    M2_MODEL, Int8ub, (RETURN_NUMBER,), ONE_RETURN, "reserved_end" / Bytes(4), *CRC_AND_COUNTER
 )
-MX_DATA = make_packet(
-    MX_SCANNER, Int8ub, (), TWO_RETURNS, "reserved_end" / Bytes(16), *CRC_AND_COUNTER
+MX_DATA = make_packet_struct(
+    MX_MODEL, Int8ub, (), TWO_RETURNS, "reserved_end" / Bytes(16), *CRC_AND_COUNTER
 )
 E1_TAIL = (
     "data_length" / Const(1200, Int16ub),
@@ -135,7 +142,7 @@ E1_TAIL = (
     "data_id" / Const(0xE5C, Int32ub),
     "crc" / Int32ub * UNCHECKED_NOTE,
 )
-E1_DATA = make_packet(E1_SCANNER, Int16ub, (), ONE_RETURN, "reserved_end" / Bytes(4), *E1_TAIL)
+E1_DATA = make_packet_struct(E1_MODEL, Int16ub, (), ONE_RETURN, "reserved_end" / Bytes(4), *E1_TAIL)
 E1_DIFOP = Struct(
     "magic" / MAGIC,
     "reserved_8" / Bytes(8),
@@ -168,23 +175,23 @@ E1_DIFOP = Struct(
 )
 
 
-def plausible(f: Fields, model: Scanner) -> Any:
+def plausible(f: Fields, model: SolidStateModel) -> Any:
     """Return whether the packet number is possible."""
     return (f.pkt_psn >= model.first) & (f.pkt_psn < model.first + 2 * model.packets)
 
 
-def last_packet_number(f: Fields, model: Scanner, dual: tuple[int, ...]) -> Any:
+def last_packet_number(f: Fields, model: SolidStateModel, dual: tuple[int, ...]) -> Any:
     """Return the last packet number of a frame, which depends on the return mode."""
     is_dual = np.logical_or.reduce([f.wave_mode == mode for mode in dual]) if dual else False
     return np.where(is_dual, 2 * model.packets, model.packets) + model.first - 1
 
 
-def pace(f: Fields, model: Scanner, dual: tuple[int, ...]) -> Any:
-    """Return the seconds from a packet to the next."""
+def pace(f: Fields, model: SolidStateModel, dual: tuple[int, ...]) -> Any:
+    """Return the time from one packet to the next, in seconds."""
     return 1 / (FRAME_RATE_HZ * (last_packet_number(f, model, dual) - model.first + 1))
 
 
-def make_counter_and_clock(model: Scanner, dual: tuple[int, ...] = ()) -> dict[str, Any]:
+def make_counter_and_clock(model: SolidStateModel, dual: tuple[int, ...] = ()) -> dict[str, Any]:
     """Return the arguments of `Sensor` for the packet counter and the clock.
 
     Args:
@@ -213,18 +220,18 @@ def common_columns(f: Fields) -> dict[str, Any]:
     }
 
 
-def points(f: Fields, returns: bool = False) -> Polar:
-    """Return a point of each channel.
+def points(f: Fields, has_return_numbers: bool = False) -> Polar:
+    """Return the points of packets with one point for each channel.
 
-    `returns` is whether blocks contain the number of the return.
+    `has_return_numbers` is true if each block contains the number of its return.
     """
     channels = f.blocks.channels
     length = np.sqrt(channels.x**2 + channels.y**2 + channels.z**2)
-    echo = np.maximum(f.blocks.return_seq - 1, 0) if returns else None
+    echo = np.maximum(f.blocks.return_seq - 1, 0) if has_return_numbers else None
     other_columns = {
         "intensity": channels.intensity,
         "return_index": echo,
-        "column": number_firings(f, M2_SCANNER.blocks) if returns else None,
+        "column": number_firings(f, M2_MODEL.blocks) if has_return_numbers else None,
         "extra": {"attribute": channels.attribute},
     }
     return Polar(range=channels.radius * length, **common_columns(f), **other_columns)
@@ -254,7 +261,7 @@ def imu(f: Fields) -> Imu:
     )
 
 
-def sweep(i: int, model: Scanner, mode: int = STRONGEST) -> dict[str, Any]:
+def sweep(i: int, model: SolidStateModel, mode: int = STRONGEST) -> dict[str, Any]:
     """Return the values of simulated packet i."""
     number = i % model.packets
     time = i / (model.packets * FRAME_RATE_HZ)
@@ -302,8 +309,8 @@ MX_DIFOP = Struct(
     "reserved_44" / Bytes(212),
 )
 
-M2_TIMING = make_counter_and_clock(M2_SCANNER, (DUAL,))
-M2_TIMING["sequence"] = dataclasses.replace(M2_TIMING["sequence"], returns=count_returns)
+M2_TIMING = make_counter_and_clock(M2_MODEL, (DUAL,))
+M2_TIMING["sequence"] = dataclasses.replace(M2_TIMING["sequence"], returns=count_packets_per_firing)
 
 M2 = dataclasses.replace(
     M1,
@@ -314,12 +321,12 @@ M2 = dataclasses.replace(
         "data": Frame(
             M2_DATA,
             data=True,
-            plausible=partial(plausible, model=M2_SCANNER),
+            plausible=partial(plausible, model=M2_MODEL),
         ),
     },
-    points=partial(points, returns=True),
+    points=partial(points, has_return_numbers=True),
     **M2_TIMING,
-    simulation=Simulation(partial(sweep, model=M2_SCANNER)),
+    simulation=Simulation(partial(sweep, model=M2_MODEL)),
     configure=None,
     range_limits=(0.2, 250.0),  # rs_driver's limits for these models
     status="manual",
@@ -334,20 +341,20 @@ MX = dataclasses.replace(
         "data": Frame(
             MX_DATA,
             data=True,
-            plausible=partial(plausible, model=MX_SCANNER),
+            plausible=partial(plausible, model=MX_MODEL),
         ),
         "difop": Frame(MX_DIFOP, simulation=Simulation(lambda i: {}, rate=1)),
     },
     points=points_mx,
-    **make_counter_and_clock(MX_SCANNER),
+    **make_counter_and_clock(MX_MODEL),
     # with dual return, so that the second radius is simulated too
-    simulation=Simulation(partial(sweep, model=MX_SCANNER, mode=DUAL)),
+    simulation=Simulation(partial(sweep, model=MX_MODEL, mode=DUAL)),
     range_limits=(0.2, 200.0),
     info={"serial": "difop.serial_number"},
     source="rs_driver (decoder_RSMX.hpp); not tested with packets of this model",
 )
 
-E1_TIMING = make_counter_and_clock(E1_SCANNER, (9, 10, 11))
+E1_TIMING = make_counter_and_clock(E1_MODEL, (9, 10, 11))
 E1_TIMING["clock"] = dataclasses.replace(
     E1_TIMING["clock"], status=make_clock_status(("internal clock", "", "PTP (E2E L2)", "gPTP"))
 )
@@ -360,13 +367,13 @@ E1 = dataclasses.replace(
         "data": Frame(
             E1_DATA,
             data=True,
-            plausible=partial(plausible, model=E1_SCANNER),
+            plausible=partial(plausible, model=E1_MODEL),
         ),
         "difop": Frame(E1_DIFOP, imu=imu, simulation=Simulation(sweep_e1, rate=1)),
     },
     points=points,
     **E1_TIMING,
-    simulation=Simulation(partial(sweep, model=E1_SCANNER)),
+    simulation=Simulation(partial(sweep, model=E1_MODEL)),
     range_limits=(0.1, 200.0),  # E1 user manual, Table 1; rs_driver's
     info={"serial": "difop.serial_number", "firmware": "difop.software"},
     source=(
