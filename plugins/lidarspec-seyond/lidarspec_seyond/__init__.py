@@ -1,15 +1,17 @@
 """Seyond (formerly Innovusion) Falcon: a forward-looking lidar over UDP.
 
-A packet contains blocks of four channels, in spherical coordinates:
+A packet has a header and `count` blocks of four channels, in spherical coordinates. A field has one
+byte, unless its size is given in parentheses:
 
-    6A 17 major minor, sequence(2) | checksum(4) size(4) source type | start of the frame(8) mode
-    status frame(8) part(2) packet(2) | item type, count(3) item size(2) topic(4) flags(2) region(4)
-    [reserved(16), from version 2] count x [angles and their differences, 17 bytes, 4 points of 4
-    bytes, or 8 with two returns]
+* header: 6A 17, major, minor, sequence(2), checksum(4), size(4), source, type, start of the
+  frame(8), mode, status, frame(8), part(2), packet(2), item type, count(3), item size(2), topic(4),
+  flags(2), region(4), and from version 2 on reserved(16);
+* block: the angles of the first channel, and the differences to the angles of the other
+  channels(17); then 4 points, or 8 points with two returns, of 4 bytes each.
 
-The checksum is not verified, because its CRC is not public. The vendor's SDK uses a table to move
-points by some centimetres away from the axis. This module does not use the table. The number of
-blocks per packet and the simulated pattern are assumed.
+The checksum is not verified, because the parameters of the CRC are not public. The vendor's SDK
+moves the points by some centimetres according to a table, which this module does not use. The
+number of blocks per packet and the simulated pattern are assumed.
 
 Source: Innovusion SDK 3.102, inno_lidar_packet.h (fields, units, bits) and
 inno_lidar_packet_utils.h (angles of the channels); its ROS driver (port 8010); data sheet of the
