@@ -1,4 +1,4 @@
-"""SICK scanners: models with LMDscandata, multiScan, picoScan and microScan3."""
+"""SICK scanners: multiScan, picoScan, microScan3, and models that send LMDscandata telegrams."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Commands of a scanner and its replies, in CoLa B or CoLa A.
+"""Commands that a scanner accepts, and its replies, in SICK's protocols CoLa B and CoLa A.
 
-Send `login` before and `run` after a change of settings. Settings are lost at power-off unless they
-are saved.
+CoLa B is binary, and CoLa A is text. Send `login` before and `run` after a change of settings. The
+settings are lost at power-off, unless the command `save` saves them.
 
 Source: the telegram listing 8014631; 8023202 (LMS4000), tables 14 to 16, for starting a stream.
 """
@@ -148,7 +148,14 @@ def make_messages(cola: str) -> Mapping[str, Frame]:
 def make_request(
     frame: str, reply: str, values: Mapping[str, Any] | None = None, **more: Any
 ) -> Command:
-    """Return the command for a request, which is repeated if no reply arrives."""
+    """Return the command that sends a request, and repeats it once if no reply arrives.
+
+    Args:
+        frame: the frame type of the request.
+        reply: the frame type of the expected reply.
+        values: the field values of the request.
+        more: other arguments of `Command`.
+    """
     return Command(frame, values or {}, reply=reply, refusal="refused", retries=1, **more)
 
 

@@ -1,8 +1,9 @@
 """multiScan100 and picoScan100: compact telegrams over UDP with scans or IMU samples.
 
-A telegram is a chain of modules under one CRC. Each module has its own layers, beams and echoes.
-The azimuths are sent for each beam, or are evenly spaced between the azimuths of the first and the
-last beam. Elevation counts downwards. Bit 0 of a beam's property means a reflector.
+A telegram contains one or more modules, and one CRC over all of them. Each module declares its
+numbers of layers, beams and echoes. The azimuths are sent for each beam, or are evenly spaced
+between the azimuths of the first and the last beam. The sent elevations are positive downwards. If
+bit 0 of a beam's property is 1, the beam has hit a reflector.
 
 Source: sick_scan_xd (compact_parser.cpp and its unit tests) for the layout of versions 3 and 4;
 multiScan136 operating instructions 8027119 for segments and layers.
@@ -258,7 +259,7 @@ def make_scanner(name: str) -> Sensor:
         links={"data": Udp(2115), "imu": Udp(7503)},
         range_limits=limits,
         relatives={
-            other: "its modules have a different number of layers"
+            other: "a module has a different number of layers in the two models"
             for other in MODELS
             if other != name
         },

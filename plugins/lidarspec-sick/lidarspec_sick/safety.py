@@ -4,11 +4,11 @@ A message is one scan. It is sent in several datagrams, each of which has its of
 
 Source: the vendor's driver sick_safetyscanners (ParseDatagramHeader, UDPPacketMerger,
 ParseDataHeader, ParseDerivedValues, ParseMeasurementData, ParseTypeCodeData.cpp, DatagramHeader.h,
-SickSafetyscannersRos.cpp). The blocks of a message may be at any offset. This module requires that
-the blocks are in the order of their entries in the header, and that the derived values and the
-measurements are sent. It does not decode the content of the blocks for the system state, intrusions
-and applications. The commands of CoLa 2, with which a program selects its address and the blocks,
-are not supported. The port is assumed.
+SickSafetyscannersRos.cpp). The format allows the blocks of a message at any offset. This module
+requires that the blocks are in the order of their entries in the header, and that the derived
+values and the measurements are sent. It does not decode the content of the blocks for the system
+state, intrusions and applications. The commands of CoLa 2, with which a host selects the blocks and
+the address to which the scanner sends them, are not supported. The port is assumed.
 """
 
 from __future__ import annotations

@@ -140,7 +140,7 @@ def sweep(i: int, family: ScannerFamily, echoes: int = 1) -> dict[str, Any]:
 def make_frames(family: ScannerFamily, cola: str) -> dict[str, Frame]:
     """Return the frames of scans, of commands and of replies.
 
-    Scans can be received in both versions of CoLa, commands and replies in `cola` only.
+    Scans can be received in CoLa A and in CoLa B, commands and replies in `cola` only.
     """
     forms = sorted("AB", key=lambda form: form != cola)
     frames = {{"A": "text", "B": "scan"}[form]: make_scan_frame(form, 1) for form in forms}
@@ -157,14 +157,15 @@ def make_frames(family: ScannerFamily, cola: str) -> dict[str, Frame]:
 
 
 def configure(sensor: Sensor, *, cola: Literal["A", "B"] = "B", echoes: int = 0) -> Sensor:
-    """Return the scanner with commands in CoLa A or B, and with a number of echoes.
+    """Return the scanner with commands in CoLa A or B, and scans with a number of echoes.
 
     Args:
-        cola: the version of CoLa for commands. Scans are read in both versions.
-        echoes: the number of echoes of a beam; 0 for the maximum of the scanner.
+        cola: the protocol for commands, "A" (text) or "B" (binary). Scans are read in both.
+        echoes: the number of echoes of each beam in the scans to read; 0 for the maximum of the
+            scanner. Scans with one echo are always read.
 
     Raises:
-        UsageError: if the scanner has fewer echoes.
+        UsageError: if the scanner cannot send this number of echoes.
     """
     family = MODELS[sensor.id][1]
     if echoes not in range(family.echoes + 1):

@@ -1,9 +1,10 @@
 """LMDscandata, the telegram of a scan, in CoLa B (binary) and CoLa A (hexadecimal text).
 
 A telegram has one layer. It has the channels DIST1 to DISTn with 16 bits. If requested, the
-channels RSSI1 to RSSIn follow, with 16 or 8 bits. If there are RSSI channels of both sizes, the
-intensity is from the 8-bit channels. Telegrams with channels of other kinds (ANGL, VANG, QLTY) are
-not supported. An angle of a third of a degree is sent as 0.3333, and is used unchanged.
+channels RSSI1 to RSSIn follow with 16 bits, with 8 bits, or twice, once with each size. In the last
+case the intensity is from the 8-bit channels. Telegrams with channels of other kinds (ANGL, VANG,
+QLTY) are not supported. An angular step of a third of a degree is sent as 0.3333 and is used
+unchanged, which is an error of 0.03 degrees at the last of 811 beams.
 
 Source: SICK Telegram Listing LiDAR sensors 8014631; operating instructions 8023198 (LMS4000) for
 the tables of LMDscandata, which state that values below 16 are not distances; 8020494 (MRS1000) for
@@ -121,7 +122,7 @@ def make_scan_fields(echoes: int) -> list[Construct]:
         "serial" / Int32ub,
         "status"
         / Array(2, Enum(Int8ub, ok=0, error=1, pollution_warning=2, pollution_error=4))
-        * "the second value is the status of the device",
+        * "the second value is the status of the device; lidarspec does not use the first value",
         "telegram_counter" / Int16ub,
         "scan_counter" / Int16ub,
         "time" / Scaled(Int32ub, 1, "us") * "time of the start of the scan, since power-up",
