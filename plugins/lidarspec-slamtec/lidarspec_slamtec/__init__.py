@@ -4,17 +4,18 @@ Source: RPLIDAR interface protocol and the vendor's SDK (sl_lidar_cmd.h, handler
 sl_lidar_driver.cpp); baud rates and ports from the SDK (_getNativeBaudRate) and the launch files of
 sllidar_ros2, ranges from the models' data sheets if `source` names them.
 
-A response descriptor announces the kind of the following data frames, and a kind is searched for
-only after its descriptor. The kinds are `node`, `express`, `ultra`, `dense`, `ultra_dense` and
-`hq`. By default, the first kind in an input is decoded. ``configure(answer="express")`` selects
-another kind, and does not wait for its descriptor. Recordings that begin after the descriptor
-require this option.
+A data frame is a node, which is one point, or a capsule, which has many points. A response
+descriptor announces the kind of the following data frames, and the decoder searches for frames of a
+kind only after the descriptor of this kind. The kinds are `node`, `express`, `ultra`, `dense`,
+`ultra_dense` and `hq`. By default, the first kind in an input is decoded. The option `answer`, for
+example ``-O answer=express``, selects another kind, for which the decoder searches without a
+descriptor. Recordings that begin after the descriptor require this option.
 
 For all kinds, a scan ends when the azimuth of the points passes zero.
 
-Nodes have no checksum, and are accepted in runs of ten without a gap. The docstring of the module
-`nodes` contains the measured rates of false nodes. Frames do not contain the times of their points,
-so all points of a frame have the time of the frame.
+Nodes have no checksum, so a node is accepted only if at least ten nodes follow each other without a
+gap. The docstring of the module `nodes` contains the measured rates of false nodes. Frames do not
+contain the times of their points, so all points of a frame have the time of the frame.
 
 Requests, descriptors, and replies with information and configuration were verified with the
 recorded communication of a live A1. Nodes, express and ultra capsules were verified with bytes that
@@ -111,7 +112,7 @@ FRAMES = {
 def configure(
     sensor: Sensor, *, dtheta: Literal["unsigned", "signed"] | None = None, mode: int | None = None
 ) -> Sensor:
-    """Return the sensor with other options for express capsules or the scan mode.
+    """Return the sensor with another interpretation of express capsules, or another scan mode.
 
     Args:
         dtheta: interpretation of the compensation in express capsules: "unsigned" as in the SDK, or
@@ -175,15 +176,16 @@ def make_rplidar(
         acknowledged={}
         if status == "manual"
         else {
-            "LS710": "the captured exchange is not part of this distribution; the project's tests"
-            " read the original file"
+            "LS710": "verified with the recorded communication of an A1, which is not distributed"
+            " with this package; the project's tests read the original file"
         },
         range_limits=range_limits,
         vendor_axes=("forward", "right", "up"),
         turn=turn,
         relatives={
             f"slamtec-rplidar-{other.lower()}": (
-                "no document describes a difference in the data; the label names the model"
+                "no document says how the data of the two models differ; the label on the sensor"
+                " names the model"
                 if {name, other} == {*SAME_MODEL_NUMBER}
                 else "info.model"
             )

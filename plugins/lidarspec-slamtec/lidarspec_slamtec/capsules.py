@@ -1,5 +1,8 @@
 """Capsules, which contain many distances and the angle of the first point.
 
+A cabin, as the SDK calls it, is a group of one, two or three points that are encoded together. A
+capsule has 32 or 40 cabins, an express capsule 16.
+
 The angles of the other points are computed with the start angle of the next capsule: point k of N
 is at ``start + (next start - start) * k / N``, minus a compensation. The points of a capsule have
 no direction if the next capsule is missing or has the bit S, which marks the first capsule after a
@@ -115,12 +118,13 @@ ULTRA = make_capsule(
                 "predict2"
                 / Scaled(BitsInteger(10, signed=True), 1, "")
                 * (
-                    "difference to `major` of the next cabin, in steps that depend on that `major`;"
-                    " 511 and -512: no return"
+                    "the distance minus the distance `major` of the next cabin, in steps that"
+                    " depend on `major` of the next cabin; 511 and -512: no return"
                 ),
                 "predict1"
                 / BitsInteger(10, signed=True)
-                * "difference to `major` of this cabin; 511 and -512: no return",
+                * "the distance minus the distance `major` of this cabin, in steps that depend on"
+                " `major`; 511 and -512: no return",
                 "major" / BitsInteger(12) * "0: no return",
             )
         ),
@@ -165,7 +169,15 @@ def point_step(f: Fields, count: int) -> Any:
 
 
 def uncompensated_angles(f: Fields, cabins: int, points: int) -> Any:
-    """Return clockwise angles in degrees without compensation, (n, cabins, points)."""
+    """Return the clockwise angles of points in degrees, without compensation.
+
+    Args:
+        cabins: the number of cabins in a capsule.
+        points: the number of points in a cabin.
+
+    Returns:
+        The angles, (n, cabins, points).
+    """
     count = cabins * points
     step = point_step(f, cabins * points)
     return stack(
@@ -195,17 +207,17 @@ def dense_points(f: Fields) -> Polar:
     return Polar(range=f.distances, azimuth=-np.deg2rad(clockwise))
 
 
-def predicted_distance(base: Any, level: Any, prediction: Any) -> Any:
+def predicted_distance(reference: Any, level: Any, prediction: Any) -> Any:
     """Return a predicted distance in mm; 0 if the prediction means no return.
 
     Args:
-        base: the reference distance in mm.
-        level: the level of the code from which the reference distance was decoded.
-        prediction: the difference from the reference in steps of 2**level mm; 511 and -512 mean no
-            return.
+        reference: the reference distance in mm.
+        level: the level of the reference distance in `CODE_LEVELS`, from 0 to 4.
+        prediction: the predicted distance minus the reference distance, in steps of 2**level mm;
+            511 and -512 mean no return.
     """
     return np.where(
-        (prediction == 511) | (prediction == -512), 0, base + prediction * np.exp2(level)
+        (prediction == 511) | (prediction == -512), 0, reference + prediction * np.exp2(level)
     )
 
 
@@ -268,7 +280,7 @@ def encode_ultra(polar: Polar) -> Mapping[str, Any]:
 
 
 def nearest_codes(mm: Any) -> Any:
-    """Return the codes with the distances nearest to `mm`; 0 for no return."""
+    """Return the ultra codes whose distances are nearest to `mm`; 0 where `mm` is 0."""
     above = np.clip(np.searchsorted(CODE_MILLIMETRES, mm), 1, len(CODE_MILLIMETRES) - 1)
     is_nearer_below = mm - CODE_MILLIMETRES[above - 1] < CODE_MILLIMETRES[above] - mm
     nearest = np.where(is_nearer_below, above - 1, above)

@@ -32,26 +32,33 @@ ANY_KEY = ("key", 0, 0xFFFF_FFFF)
 
 
 def make_plain_request(cmd: str, **more: Any) -> Command:
-    """Return the command for a request without payload and reply."""
+    """Return the command that sends a request without payload and expects no reply."""
     return Command("request", {"cmd.number": cmd}, **more)
 
 
 def make_request(
     frame: str, reply: str | tuple[str, ...], values: Mapping[str, Any] | None = None, **more: Any
 ) -> Command:
-    """Return the command for a request with a reply."""
+    """Return the command that sends a request, and repeats it once if no reply arrives.
+
+    Args:
+        frame: the frame type of the request.
+        reply: the frame types of possible replies.
+        values: the field values of the request.
+        more: other arguments of `Command`.
+    """
     return Command(
         frame, values or {}, reply=reply, retries=1, only_stopped=not more.get("starts"), **more
     )
 
 
 def make_sensor_request(key: int) -> Command:
-    """Return the request for a configuration value of the sensor."""
+    """Return the command that requests a configuration value of the sensor."""
     return make_request("config_request", "config", {"key": key}, echoes=("key",))
 
 
 def make_mode_request(key: int) -> Command:
-    """Return the request for a configuration value of a scan mode."""
+    """Return the command that requests a configuration value of a scan mode."""
     return make_request(
         "mode_config_request",
         "config",
@@ -62,7 +69,7 @@ def make_mode_request(key: int) -> Command:
 
 
 def make_express_request(mode: int | None = None) -> Command:
-    """Return the request for capsules of one scan mode.
+    """Return the command that requests capsules of one scan mode.
 
     If `mode` is None, the mode is an argument of the command.
     """

@@ -1,10 +1,11 @@
 """Points with their own angle: nodes of five bytes, and HQ capsules of 96 nodes.
 
-An HQ capsule has a CRC-32, but a node has no checksum. A node is valid if S and its inverse differ,
-the check bit is 1 and the angle is below 360 degrees. This is true for 17.6 % of all random
-sequences of five bytes. Nodes are therefore accepted only in runs of `CONFIRM` nodes without a gap.
-The table shows the number of false nodes, i.e. accepted nodes that were not sent, if runs of 1, 6,
-8 or 10 nodes are required. 10 is the selected value:
+An HQ capsule has a CRC-32, but a node has no checksum. A node is valid if its start bit S differs
+from the bit that is sent as the inverse of S, the check bit is 1 and the angle is below 360
+degrees. This is true for 17.6 % of all random sequences of five bytes. A node is therefore accepted
+only if it is in a run, that is a sequence without a gap, of at least `CONFIRM` nodes. The table
+shows the number of false nodes, i.e. accepted nodes that were not sent, if runs of 1, 6, 8 or 10
+nodes are required. 10 is the selected value:
 
     random bytes, 8 MiB                          865 530    1 192      32       0
     express capsules, 2 MiB                      227 743    3 767     551     159
@@ -14,9 +15,10 @@ The table shows the number of false nodes, i.e. accepted nodes that were not sen
     beginning in the middle of a node, 300 x         135        9       0       0
     nodes with 1 % of the bytes damaged, 2 MiB     7 430    1 811   1 760   1 732
 
-Nodes are searched for only after the descriptor 81. Capsules are therefore searched for nodes only
-if a later descriptor was lost. Of 419,430 nodes that were sent, 411,423 are found with runs of 1,
-and 395,728 with runs of 10. A test repeats this with less data.
+The decoder searches for nodes only after the descriptor 81. It searches the bytes of capsules for
+nodes only if the descriptor of the capsules was lost. In the last row of the table, 419,430 nodes
+were sent; 411,423 of them are found if no run is required, and 395,728 if runs of 10 are required.
+A test repeats these measurements with less data.
 
 Source: RPLIDAR interface protocol, "SCAN"; HQ capsules: the vendor's SDK (sl_lidar_cmd.h,
 handler_hqnode.cpp).
@@ -94,7 +96,7 @@ HQ = Checksummed(
 
 
 def plausible(f: Fields) -> Any:
-    """Return whether S and its inverse differ and the angle is below 360 degrees."""
+    """Return whether a node is valid: its bits `start` and `inverse`, and its angle."""
     return (f.head.start != f.head.inverse) & (f.beam.angle < 360)
 
 
