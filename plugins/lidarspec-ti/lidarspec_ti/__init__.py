@@ -5,12 +5,13 @@ A frame on the data UART consists of a header and of parts, each with a type and
 32 bytes. Each point has a velocity. The SNRs of the points are in a separate part, in the order of
 the points: ``packets.parts("tlvs.side_info")``.
 
-Source: TI, "Understanding the Out of Box Demo Data Output" (mmWave industrial toolbox 4.10), in
-which the size of the header is given as 44 bytes, but is 40 bytes according to its own table;
-mmWave SDK 3.5 (mmw_output.h) for the types of parts, dpif_pointcloud.h for points and SNR. It is
-assumed that CPU cycles are those of the R4F at 200 MHz. The longest range is assumed. Heat maps,
-and parts of other demos of the toolbox, are kept as bytes. This plugin does not configure and start
-the radar: send the lines of a .cfg file to the other UART of the radar, at 115 200 baud.
+Source: TI, "Understanding the Out of Box Demo Data Output" (mmWave industrial toolbox 4.10);
+mmWave SDK 3.5, mmw_output.h (types of parts) and dpif_pointcloud.h (points and SNR). The text of
+the first document gives 44 bytes as the size of the header. The table of the header in the same
+document results in 40 bytes, which this module uses. It is assumed that CPU cycles are those of the
+R4F at 200 MHz. The longest range is assumed. Heat maps, and parts of other demos of the toolbox,
+are kept as bytes. This plugin neither configures nor starts the radar: send the lines of a .cfg
+file to the other UART of the radar, at 115 200 baud.
 """
 
 from __future__ import annotations
@@ -222,7 +223,10 @@ IWR6843 = Sensor(
             data=True,
             max_length=32_768,
             points={"tlvs.points": points},
-            acknowledged={"LS203": "heat maps are long and rarely requested"},
+            acknowledged={
+                "LS203": "the longest frames have heat maps, which are rarely requested and not"
+                " simulated"
+            },
         )
     },
     points=None,
