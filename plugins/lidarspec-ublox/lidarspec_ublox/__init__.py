@@ -193,7 +193,7 @@ SET_MESSAGE = make_ubx(  # UBX-CFG-MSG, p. 54
     3,
     "message_class" / Int8ul,
     "message_id" / Int8ul,
-    "rate" / Int8ul * "the message is sent once per this number of solutions; 0: never",
+    "rate" / Int8ul * "n: the message is sent with every n-th navigation solution; 0: never",
 )
 SET_RATE = make_ubx(  # UBX-CFG-RATE, p. 75
     b"\x06\x08",
@@ -268,17 +268,17 @@ WIRE_GGA = replace(SENTENCE, formats=COORDINATES | {"satellites": "00", "horizon
 WIRE_OTHER = replace(SENTENCE, joined=1, rest=True)
 
 
-def is_date(f: Fields) -> Any:
-    """Return whether date and time have possible values."""
+def is_plausible_date(f: Fields) -> Any:
+    """Return whether date and time are within their limits."""
     return (f.month <= 12) & (f.day <= 31) & (f.hour < 24) & (f.minute < 60) & (f.second <= 60)
 
 
-def is_position(f: Fields) -> Any:
-    """Return whether the position is on Earth and the date is possible."""
-    return is_date(f) & (abs(f.latitude) <= 90) & (abs(f.longitude) <= 180)
+def is_plausible_position(f: Fields) -> Any:
+    """Return whether latitude, longitude, date and time are within their limits."""
+    return is_plausible_date(f) & (abs(f.latitude) <= 90) & (abs(f.longitude) <= 180)
 
 
-def is_pulse(f: Fields) -> Any:
+def is_plausible_pulse(f: Fields) -> Any:
     return f.time_of_week < WEEK_S
 
 
@@ -424,17 +424,19 @@ GNSS = Sensor(
     frames={
         "nav_pvt": Frame(
             NAV_PVT,
-            plausible=is_position,
+            plausible=is_plausible_position,
             clock=Clock(utc_time, epoch="utc", status=PVT_CLOCK_STATUS),
             simulation=Simulation(pvt_sweep, rate=5),
         ),
         "nav_timeutc": Frame(
             NAV_TIMEUTC,
-            plausible=is_date,
+            plausible=is_plausible_date,
             clock=Clock(utc_time, epoch="utc", status=TIMEUTC_CLOCK_STATUS),
             simulation=Simulation(timeutc_sweep, rate=1),
         ),
-        "tim_tp": Frame(TIM_TP, plausible=is_pulse, simulation=Simulation(pulse_sweep, rate=1)),
+        "tim_tp": Frame(
+            TIM_TP, plausible=is_plausible_pulse, simulation=Simulation(pulse_sweep, rate=1)
+        ),
         "rmc": make_sentence_frame(RMC, WIRE_RMC, simulation=Simulation(rmc_sweep, rate=1)),
         "gga": make_sentence_frame(GGA, WIRE_GGA, simulation=Simulation(gga_sweep, rate=1)),
         "acknowledge": Frame(ACKNOWLEDGE),
