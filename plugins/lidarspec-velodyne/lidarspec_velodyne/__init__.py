@@ -4,12 +4,13 @@ Spinning lidars with 16 to 128 lasers over UDP.
 
 Source: velodyne_decoder (calibration files, calib_db.cpp, packet_decoder.cpp) and
 ros-drivers/velodyne (rawdata), which cite the vendor's user manuals: laser angles, firing times,
-focal distances. Lasers have vertical offsets, which result from the focal distance. The offsets are
-documented for the VLP-16 (11.2 mm at -15 degrees). ros-drivers and nebula ignore the offsets, so
-the z values of this module differ by up to 27 mm.
+focal distances. Lasers have vertical offsets. The offsets are documented for the VLP-16 (11.2 mm at
+-15 degrees); this module calculates the offsets of all models from their focal distances.
+ros-drivers and nebula ignore the offsets, so the z values of this module differ by up to 27 mm.
 
-The sources contradict each other on the firing times of a VLS-128. This module follows
-velodyne_decoder: two idle slots follow eight groups, and the first firing is 7 us before the
+The sources contradict each other on the firing times of a VLS-128, which fires its lasers in 16
+groups of eight. This module follows velodyne_decoder: after the eighth group and after the last
+group, the sensor does not fire for the time of two groups, and the first firing is 7 us before the
 packet's time.
 """
 
@@ -24,7 +25,7 @@ import numpy as np
 from construct import Const, Enum, Int8ul
 
 from lidarspec.spec import Clock, Frame, OnWrap, Relative, Sensor, Simulation, Udp, hookimpl
-from lidarspec_velodyne.firings import Firings, configure, pace, points, sweep
+from lidarspec_velodyne.firings import FiringPattern, configure, pace, points, sweep
 from lidarspec_velodyne.frames import (
     BANK,
     BANKS,
@@ -47,7 +48,7 @@ from lidarspec_velodyne.hdl64e import HDL64E_S2, HDL64E_S3
 
 SLOT_INDEX = np.arange(SLOTS)
 
-VLP16_FIRINGS = Firings(
+VLP16_FIRINGS = FiringPattern(
     # 16 lasers, each firing twice in a block: 2.304 us from laser to laser, the second round
     # 55.296 us after the first
     elevation=np.tile([-15.0, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15], 2),
@@ -94,7 +95,7 @@ UPPER_LASERS = [
     10.67,
 ]
 
-HDL32E_FIRINGS = Firings(
+HDL32E_FIRINGS = FiringPattern(
     # 32 lasers 1.152 us apart, alternating between the lower and the upper half
     elevation=np.array([LOWER_LASERS, UPPER_LASERS]).T.ravel(),
     delay=1.152e-6 * SLOT_INDEX.astype(np.float64),
@@ -151,10 +152,10 @@ HI_RES_FIRINGS = dataclasses.replace(
     product=0x24,
 )
 
-VLP32C_FIRINGS = Firings(
+VLP32C_FIRINGS = FiringPattern(
     # 32 lasers, two at a time, 2.304 us apart
     elevation=np.array(VLP32C_ELEVATION),
-    offset=np.array(VLP32C_OFFSET),
+    azimuth_offset=np.array(VLP32C_OFFSET),
     delay=(SLOT_INDEX // 2).astype(np.float64) * 2.304e-6,
     period=55.296e-6,
     focal_distance=0.0424,
@@ -167,16 +168,16 @@ GROUP_PERIOD_S = 8 / 3 * 1e-6
 VLS128_LASERS = np.arange(4 * SLOTS).reshape(4, SLOTS)
 
 
-def make_vls128_firings(returns: int) -> Firings:
+def make_vls128_firings(returns: int) -> FiringPattern:
     """Return the firing pattern for 1 or 2 returns."""
 
     def fill_blocks(values: Any) -> Any:
         table = np.reshape(values, (4, SLOTS))
         return np.repeat(table, 2, axis=0) if returns == 2 else np.tile(table, (3, 1))
 
-    return Firings(
+    return FiringPattern(
         elevation=fill_blocks(VLS128_ELEVATION),
-        offset=fill_blocks(np.tile(VLS128_OFFSET, 16)),
+        azimuth_offset=fill_blocks(np.tile(VLS128_OFFSET, 16)),
         delay=fill_blocks((VLS128_LASERS // 8 + 2 * (VLS128_LASERS // 64)) * GROUP_PERIOD_S),
         period=20 * GROUP_PERIOD_S,
         focal_distance=0.05863,
@@ -231,8 +232,8 @@ HI_RES_RELATIVE = {
 
 
 UNPUBLISHED = {
-    "LS710": "the license of the captured packet does not allow a copy in this distribution; the"
-    " project's tests read the original file"
+    "LS710": "verified with a captured packet, whose license does not allow a copy in this package;"
+    " the project's tests read the original file"
 }
 
 VLP16 = Sensor(
@@ -277,7 +278,7 @@ VLP16 = Sensor(
 )
 
 
-def make_related_model(id: str, model: str, firings: Firings, **facts: Any) -> Sensor:
+def make_related_model(id: str, model: str, firings: FiringPattern, **facts: Any) -> Sensor:
     """Return another model of the family, derived from the VLP-16.
 
     Args:

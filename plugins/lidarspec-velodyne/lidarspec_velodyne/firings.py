@@ -9,8 +9,8 @@ The next azimuth cannot be used if a packet was lost, if a sector is masked in t
 settings, or if there is no next block. In these cases, the option `last_block` selects the
 azimuths:
 
-* "previous", the default: the last valid step is used again, as ros-drivers and nebula do for the
-  last block of every packet.
+* "previous", the default: the last valid difference between two azimuths is used again, as
+  ros-drivers and nebula do for the last block of every packet.
 * "invalid": the firings of the block have no direction, and their points are not valid.
 
 Source: ros-drivers/velodyne rawdata.cc (azimuths); velodyne_decoder packet_decoder.cpp and
@@ -35,19 +35,22 @@ MAX_SPEED_DEG_S = SPEED_LIMITS_HZ[1] * 360
 
 
 @dataclass(frozen=True, eq=False)
-class Firings:
+class FiringPattern:
     """The firing pattern of a model.
+
+    A slot is the position of a laser's values in a block.
 
     Attributes:
         elevation: degrees, (32,), for the laser of each slot of a block; (blocks, 32) if the blocks
             contain different lasers.
-        delay: seconds from the first firing with the same azimuth to the firing of each slot, in
-            the shape of `elevation`.
+        delay: the time in seconds at which the laser of each slot fires, counted from the first
+            firing of the blocks with this azimuth, in the shape of `elevation`.
         period: seconds from one azimuth to the next.
         focal_distance: metres. The beams leave the lens at different heights, and cross at this
             distance.
         product: the value of the product byte for this model.
-        offset: degrees to the left of the azimuth for each slot, in the shape of `elevation`.
+        azimuth_offset: the direction of the laser of each slot, in degrees to the left of the
+            azimuth, in the shape of `elevation`.
         blocks_per_azimuth: with single return, the number of blocks with the same azimuth.
         returns: the number of returns of each firing; 0 if the packets contain this number.
         start: seconds from the time of the packet to the first firing in it.
@@ -58,14 +61,14 @@ class Firings:
     period: float
     focal_distance: float
     product: int
-    offset: NDArray[np.float64] | float = 0.0
+    azimuth_offset: NDArray[np.float64] | float = 0.0
     blocks_per_azimuth: int = 1
     returns: int = 0
     start: float = 0.0
 
     @property
     def blocks(self) -> int:
-        """The number of blocks of a packet with points."""
+        """The number of blocks with points in a data packet."""
         return BLOCKS if self.elevation.ndim == 1 else len(self.elevation)
 
     @property
@@ -79,14 +82,14 @@ class Firings:
         return -self.focal_distance * np.tan(np.deg2rad(self.elevation))
 
 
-def points(f: Fields, model: Firings, last_block: LastBlock = "previous") -> Polar:
+def points(f: Fields, model: FiringPattern, last_block: LastBlock = "previous") -> Polar:
     """Return the points of a packet."""
     dual = model.returns == 2 if model.returns else f.return_mode == DUAL
     block = np.arange(model.blocks)[:, None]
     clockwise = (
         f.blocks.azimuth
         + block_step(f, dual, model, last_block) * (model.delay / model.period)
-        - model.offset
+        - model.azimuth_offset
     )
     return Polar(
         range=f.blocks.channels.distance,
@@ -104,22 +107,25 @@ def points(f: Fields, model: Firings, last_block: LastBlock = "previous") -> Pol
     )
 
 
-def block_step(f: Fields, dual: Any, model: Firings, last_block: LastBlock) -> Any:
+def block_step(f: Fields, dual: Any, model: FiringPattern, last_block: LastBlock) -> Any:
     """Return the degrees from each block's azimuth to the next, (n, blocks, 1)."""
     azimuth = f.blocks.azimuth
-    ahead = np.where(
+    next_azimuth = np.where(
         dual,
         following(azimuth, 2 * model.blocks_per_azimuth),
         following(azimuth, model.blocks_per_azimuth),
     )
     repeat = last_block == "previous"
-    return between_blocks(azimuth, ahead, fastest=MAX_SPEED_DEG_S * model.period, repeat=repeat)
+    return between_blocks(
+        azimuth, next_azimuth, fastest=MAX_SPEED_DEG_S * model.period, repeat=repeat
+    )
 
 
 def configure(sensor: Sensor, /, *, last_block: LastBlock) -> Sensor:
-    """Return the sensor with a rule for the last block.
+    """Return the sensor with a rule for blocks whose next azimuth cannot be used.
 
-    "previous" uses the last valid step again. "invalid" makes the points of the block invalid.
+    Such a block is, for example, the last block of the input. "previous" uses the last valid
+    difference between two azimuths again. "invalid" makes the points of the block invalid.
     """
 
     def set_rule(function: Any) -> Any:
@@ -132,13 +138,13 @@ def configure(sensor: Sensor, /, *, last_block: LastBlock) -> Sensor:
     return dataclasses.replace(sensor, points=set_rule(sensor.points), frames=frames)
 
 
-def pace(f: Fields, model: Firings) -> Any:
-    """Return the seconds from a packet to the next."""
+def pace(f: Fields, model: FiringPattern) -> Any:
+    """Return the time from one packet to the next, in seconds."""
     shots = BLOCKS // model.blocks_per_azimuth
     return np.where(f.return_mode == DUAL, shots // 2, shots) * model.period
 
 
-def sweep(i: int, model: Firings, flags: Any = None) -> dict[str, Any]:
+def sweep(i: int, model: FiringPattern, flags: Any = None) -> dict[str, Any]:
     """Return the values of simulated packet i, at 10 revolutions a second.
 
     `flags` are the flags of the blocks, if the model has them.

@@ -4,8 +4,8 @@ Data packets are sent to UDP port 2368, and position packets to port 8308. Posit
 same for all models.
 
 Source: velodyne_decoder (types.h, telemetry_packet.h) and ros-drivers/velodyne, which cite the
-vendor's user manuals; for the leading zeros and the inertial measurements in position packets,
-VeloView's position reader.
+vendor's user manuals; VeloView's position reader (the zeros and the inertial measurements at the
+start of position packets).
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ BANK_CODES = {
 }
 BANK = Enum(Int16ub, **BANK_CODES)
 PRODUCT_CODES = {"HDL-32E": 0x21, "VLP-16": 0x22, "Puck Hi-Res": 0x24}
-PRODUCT = Enum(Int8ul, **PRODUCT_CODES) * "unreliable: VLP-16 with old firmware sends 0x21"
+PRODUCT = Enum(Int8ul, **PRODUCT_CODES) * "not reliable: a VLP-16 with old firmware sends 0x21, too"
 
 POSITION = Struct(
     "zeros" / Const(bytes(14)),
@@ -138,7 +138,10 @@ POSITION = Struct(
 
 
 def plausible(f: Fields) -> Any:
-    """Return whether azimuths are at most 360 degrees and the model is not a VLP-32C."""
+    """Return whether azimuths are at most 360 degrees and the product is not a VLP-32C.
+
+    The distances of a VLP-32C have steps of another size.
+    """
     return (f.blocks.azimuth <= 360) & (f.product != VLP32C_PRODUCT)
 
 
@@ -148,7 +151,10 @@ def is_plausible_vlp32c(f: Fields) -> Any:
 
 
 def is_plausible_single(f: Fields) -> Any:
-    """Return whether azimuths, banks and return mode are those of single return."""
+    """Return whether a packet can be from a VLS-128 with single return.
+
+    The four banks of 32 lasers are then in consecutive blocks, three times.
+    """
     return (
         (f.blocks.azimuth <= 360)
         & (f.blocks.flag == np.tile(BANKS, (3, 1)))
@@ -157,7 +163,10 @@ def is_plausible_single(f: Fields) -> Any:
 
 
 def is_plausible_dual(f: Fields) -> Any:
-    """Return whether azimuths are valid, and each bank has two consecutive blocks."""
+    """Return whether a packet can be from a VLS-128 with dual return.
+
+    Each of the four banks of 32 lasers then has two consecutive blocks.
+    """
     return (f.blocks.azimuth <= 360) & (f.blocks.flag == np.repeat(BANKS, 2, axis=0))
 
 
@@ -186,10 +195,12 @@ CLOCK_STATUS = ClockStatus(
 
 
 def nmea_seconds(f: Fields) -> Any:
-    """Return the time of the first valid sentence, seconds since 1970.
+    """Return the time in the first valid NMEA sentence of position packets.
+
+    A sentence is valid only if the packet reports that the clock is locked to PPS.
 
     Returns:
-        The time for the packet with the sentence, nan for all other packets, (n,).
+        Seconds since 1970 for the packet with this sentence, nan for all other packets, (n,).
     """
     is_locked = np.asarray(f.pps).reshape(-1) == PPS_LOCKED
     seconds = np.full(len(is_locked), np.nan)

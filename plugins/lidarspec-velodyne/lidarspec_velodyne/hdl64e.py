@@ -8,10 +8,11 @@ same azimuth (velodyne_decoder); the first two contain the strongest return.
 
 Each laser of each unit has its own corrections. The corrections are in the unit's file (db.xml),
 and are also sent in `status_value`, one byte in each packet. The corrections in this module are
-those of an example unit. Clouds are marked as nominal until `configure(calibration=...)` reads the
-unit's file. Not supported: the second correction of near distances (below 25 m), intensity by focal
-distance, and the calibration in the status bytes. No captured packet was available. The clock has
-no date; the date is only in the status bytes.
+those of an example unit. Clouds are marked as nominal, unless the sensor is configured with the
+unit's file, as in `configure(calibration=...)`. Three things are not supported: the second
+correction of a distance, which applies to distances below 25 m; the correction of the intensity,
+which depends on the focal distance; and the calibration in the status bytes. No captured packet was
+available. The clock has no date; the date is only in the status bytes.
 """
 
 from __future__ import annotations
@@ -75,12 +76,12 @@ class UnitCalibration:
     """The calibration of one HDL-64E, and the firing times of its model series.
 
     Attributes:
-        period: seconds from shot to shot.
-        group_period: microseconds from the first firing of a group of four lasers to that of the
-            next group.
+        period: seconds from one firing of all lasers to the next.
+        group_period: microseconds from the first firing of a group of four lasers to the first
+            firing of the next group.
         delays_in_group: the delay of each of the four lasers of a group, in microseconds.
         vertical: elevation of the 64 lasers in degrees.
-        offset: direction of each laser, in degrees to the left of the azimuth.
+        azimuth_offset: direction of each laser, in degrees to the left of the azimuth.
         height: offset of each beam upwards, perpendicular to the beam, in metres.
         distance: metres to add to the measured distance.
         left_offset: offset of each beam to the left, perpendicular to the beam, in metres.
@@ -91,7 +92,7 @@ class UnitCalibration:
     group_period: float
     delays_in_group: tuple[float, ...]
     vertical: tuple[float, ...]
-    offset: tuple[float, ...]
+    azimuth_offset: tuple[float, ...]
     height: tuple[float, ...]
     distance: tuple[float, ...]
     left_offset: tuple[float, ...] = (0.026, -0.026) * SLOTS
@@ -103,7 +104,7 @@ class UnitCalibration:
 
     @property
     def delay(self) -> Any:
-        """Seconds from the beginning of a shot to the firing of each slot, (slots,)."""
+        """Seconds from the first firing with an azimuth to the firing of each slot, (slots,)."""
         slot = np.arange(SLOTS)
         return (slot // 4 * self.group_period + np.take(self.delays_in_group, slot % 4)) * 1e-6
 
@@ -120,7 +121,7 @@ S2 = UnitCalibration(
         -19.184, -15.689, -15.178, -18.724, -18.218, -14.598, -14.081, -17.762, -17.112, -10.539, -9.994, -13.407, -12.974, -9.619,
         -9.072, -12.417, -12.07,
     ),
-    offset=(
+    azimuth_offset=(
         -7.156, -3.967, 4.721, 7.896, -0.642, 2.624, -1.813, 1.341, 5.767, 9.165, 4.763, 7.943, -7.195, -3.848, -8.353, -5.095, -0.745,
         2.634, -1.855, 1.393, 5.746, 9.092, 4.609, 7.946, -7.165, -3.905, -8.326, -5.102, -0.691, 2.515, -1.895, 1.463, -7.626, -4.149,
         4.751, 8.025, -0.688, 2.769, -2.053, 1.54, 6.167, 9.622, 4.934, 8.608, -7.448, -4.016, -8.787, -5.316, -0.688, 2.72, -1.935,
@@ -149,7 +150,7 @@ S3 = UnitCalibration(
         -20.34, -23.95, -23.44, -19.74, -19.14, -22.82, -22.27, -15.58, -15.15, -18.72, -18.19, -14.72, -14.16, -17.77, -17.3, -13.73,
         -13.13, -16.71, -16.2, -9.37, -9.15, -12.37, -12.05, -8.65, -8.11, -11.59, -11.12,
     ),
-    offset=(
+    azimuth_offset=(
         -4.55, -2.46, 3.3, 5.52, -0.23, 2.05, -1.01, 1.22, 4.05, 6.29, 3.26, 5.54, -4.55, -2.28, -5.31, -3.09, -0.26, 2.01, -1.04, 1.21,
         4.01, 6.23, 3.23, 5.46, -4.58, -2.32, -5.35, -3.09, -0.28, 1.95, -1.1, 1.18, -7.45, -3.99, 5.01, 8.21, -0.51, 2.96, -1.82, 1.69,
         6.43, 9.79, 5.23, 8.7, -7.27, -3.8, -8.63, -5.1, -0.46, 2.86, -1.75, 1.69, 6.13, 9.49, 5.01, 8.43, -7, -3.76, -8.3, -4.98,
@@ -201,10 +202,10 @@ def points(f: Fields, unit: UnitCalibration) -> Polar:
     azimuth = f.blocks.azimuth
     block = f.blocks.index
     is_dual_return = is_dual(f)
-    ahead = np.where(is_dual_return, following(azimuth, 4), following(azimuth, 2))
-    step = between_blocks(azimuth, ahead, fastest=MAX_SPEED_DEG_S * unit.period)
+    next_azimuth = np.where(is_dual_return, following(azimuth, 4), following(azimuth, 2))
+    step = between_blocks(azimuth, next_azimuth, fastest=MAX_SPEED_DEG_S * unit.period)
     clockwise = np.deg2rad(
-        azimuth + step * (unit.delay / unit.period) - unit.arrange_by_block(unit.offset)
+        azimuth + step * (unit.delay / unit.period) - unit.arrange_by_block(unit.azimuth_offset)
     )
     elevation = np.deg2rad(unit.arrange_by_block(unit.vertical))
     height = unit.arrange_by_block(unit.height)
@@ -260,14 +261,14 @@ def configure(unit: UnitCalibration, sensor: Sensor, /, *, calibration: str | Pa
             f"{calibration!s}: contains {len(lasers)} entries with {len(table)} different lasers,"
             f" expected one entry for each laser from 0 to {2 * SLOTS - 1}"
         )
-    offset, vertical, *metres = (
+    azimuth_offset, vertical, *metres = (
         tuple(column) for column in np.array([table[laser] for laser in sorted(table)]).T
     )
     distance, height, left_offset = (tuple(value / 100 for value in column) for column in metres)
     corrected = replace(
         unit,
         vertical=vertical,
-        offset=offset,
+        azimuth_offset=azimuth_offset,
         distance=distance,
         height=height,
         left_offset=left_offset,
@@ -285,7 +286,7 @@ def _parse_number(laser: ElementTree.Element, name: str) -> float:
 
 
 def pace(f: Fields, unit: UnitCalibration) -> Any:
-    """Return the seconds from a packet to the next."""
+    """Return the time from one packet to the next, in seconds."""
     return np.where(is_dual(f), 3, 6) * unit.period
 
 
