@@ -1,15 +1,16 @@
 """YDLIDAR's 360 degree lidars over a UART.
 
 All models send the same packet, with one of eight formats of samples. Most models start to measure
-after a request. Models with one channel cannot receive, and measure without a request.
+after a request. Models that only send (the vendor calls them single-channel) measure without a
+request.
 
 Source: YDLIDAR SDK, "YDLidar-SDK Communication Protocol" (scan command response, angle analysis).
 
-Known errors and gaps: the angles of the protocol's example, 217.0178 and 235.6326 degrees, are
-217.0191 and 235.6313 by its own formula. Packets do not contain the format of their samples. A
-format can only be recognised if no other format has samples of the same size, so select the model
-by its name. Not supported: GS1, GS2, GS5 and TIA, which have other protocols, and the network
-models T15 and T30.
+Known errors and gaps: the protocol's example gives the angles 217.0178 and 235.6326 degrees, but
+the formula in the protocol results in 217.0191 and 235.6313 degrees. Packets do not contain the
+format of their samples. A format can be recognised only if no other format has samples of the same
+size, so select the model by its name. GS1, GS2, GS5 and TIA, which have other protocols, and the
+network models T15 and T30 are not supported.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ def plausible(f: Fields) -> Any:
 @cache
 def make_data_frame(sample_format: SampleFormat) -> Frame:
     """Return the frame of a packet with samples of this format."""
-    frequency = Scaled(BitsInteger(7), 0.1, "Hz", sample_format.slowest)
+    frequency = Scaled(BitsInteger(7), 0.1, "Hz", sample_format.lowest_frequency_hz)
     struct = Struct(
         "header" / Const(b"\xaa\x55"),
         "ct"
@@ -96,10 +97,12 @@ def make_data_frame(sample_format: SampleFormat) -> Frame:
             "frequency"
             / frequency
             * (
-                "in a zero packet: scans per second, 0 if unknown; in other packets: the state"
-                " of a T-mini or an X4 Pro"
+                "in the first packet of a revolution: scans per second, unknown if the raw value is"
+                " 0; in other packets: the state of a T-mini or an X4 Pro"
             ),
-            "start" / BitsInteger(1) * "1: a zero packet, with which a revolution begins",
+            "start"
+            / BitsInteger(1)
+            * "1: the first packet of a revolution (zero packet), which has one sample",
         ),
         "lsn" / Int8ul * "number of samples",
         "fsa" / make_angle() * "angle of the first sample",
@@ -130,7 +133,8 @@ def points(f: Fields, sample_format: SampleFormat) -> Polar:
         else raw + sample_format.correction(f.samples.distance)
     )
     rate_hz = last(
-        f.ct.frequency, where=(f.ct.start == 1) & (f.ct.frequency > sample_format.slowest)
+        f.ct.frequency,
+        where=(f.ct.start == 1) & (f.ct.frequency > sample_format.lowest_frequency_hz),
     )
     return Polar(
         range=f.samples.distance,
@@ -149,7 +153,7 @@ def sweep(i: int, model: Model) -> dict[str, float]:
     return {
         "ct.frequency": SIMULATED_SPEED_HZ
         if packet == 0
-        else model.sample_format.slowest + GOOD_STATE_HZ * model.has_state,
+        else model.sample_format.lowest_frequency_hz + GOOD_STATE_HZ * model.has_state,
         "ct.start": int(packet == 0),
         "lsn": count,
         "fsa.angle": first * 360 / steps,
@@ -162,28 +166,32 @@ def make_id(name: str) -> str:
     return "ydlidar-" + name.lower().replace("t-mini", "tmini").replace(" ", "-")
 
 
-def contains_state(f: Fields, slowest: float) -> Any:
+def contains_state(f: Fields, lowest_frequency_hz: float) -> Any:
     """Return whether a packet contains the device's state.
 
     Source: protocol, CT.
     """
-    return (f.ct.start == 0) & (f.ct.frequency > slowest)
+    return (f.ct.start == 0) & (f.ct.frequency > lowest_frequency_hz)
 
 
 def describe_difference(own: Model, other: Model) -> str | Relative:
     """Return how to recognize another model with the same sample size."""
     if other.has_state and not own.has_state:
         return Relative(
-            "packets that do not begin a revolution have bits set in CT",
-            partial(contains_state, slowest=own.sample_format.slowest),
+            "the other model sets bits of CT in packets that do not begin a revolution",
+            partial(contains_state, lowest_frequency_hz=own.sample_format.lowest_frequency_hz),
         )
     if own.number and other.number:
         return "info.model"
     return "both models send the same packets; the label and possibly the baud rate differ"
 
 
-def relatives(name: str) -> dict[str, str | Relative]:
-    """Return, by id, how to recognize the other models with the same sample size."""
+def describe_relatives(name: str) -> dict[str, str | Relative]:
+    """Return how to recognize each of the other models with the same sample size.
+
+    Returns:
+        A dict from the id of the other model to a text or a `Relative`.
+    """
     own_model = MODELS[name]
     models = {
         make_id(other): describe_difference(own_model, model)
@@ -192,7 +200,8 @@ def relatives(name: str) -> dict[str, str | Relative]:
     }
     return models | dict.fromkeys(
         CSPC_MODELS.get(own_model.sample_format.size, ()),
-        "a sensor of CSPC sends an `info` frame when it is started",
+        "a sensor of the vendor CSPC, which sends similar packets, also sends an `info` frame when"
+        " it is started",
     )
 
 
@@ -225,7 +234,7 @@ def make_lidar(name: str) -> Sensor:
         range_limits=model.range_limits,
         vendor_axes=("forward", "right", "up"),
         turn=model.turn,
-        relatives=relatives(name),
+        relatives=describe_relatives(name),
         info={"serial": "info.serial", "model": "info.model"} if has_requests else {},
         status=model.status,
         source=source,

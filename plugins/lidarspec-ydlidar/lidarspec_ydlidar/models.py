@@ -22,8 +22,8 @@ class Model:
         turn: the lowest and the highest number of scans per second.
         number: the model number in the device information; 0 if it is not documented.
         is_send_only: whether the model only sends and cannot receive.
-        has_state: whether packets that are not zero packets contain the state of the device, in the
-            bits of the scan frequency.
+        has_state: whether all packets except the first packet of a revolution contain the state of
+            the device, in the bits of the scan frequency.
     """
 
     sample_format: SampleFormat

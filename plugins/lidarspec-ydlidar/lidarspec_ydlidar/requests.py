@@ -1,10 +1,11 @@
 """Requests of the host, ``A5 cmd``, and replies of a YDLIDAR.
 
 Source: YDLIDAR SDK, "YDLidar-SDK Communication Protocol" (system commands);
-core/common/ydlidar_protocol.h (stamps). The request for the health is 92 in the SDK, and 91 in
-older manuals; the request for a reset is 80 or 40. The order of the two bytes of the firmware
-version differs between manuals (for a T-mini, 00 01 is 1.0). Commands that only some models have
-(low power, constant frequency, heartbeat, zero offset, pitch) are omitted.
+core/common/ydlidar_protocol.h (the frame `stamp`). The sources disagree about two requests. The
+request for the health is 92 (hexadecimal) in the SDK, and 91 in older manuals; the request for a
+reset is 80 in some sources, and 40 in others. This module sends 92 and 80. The order of the two
+bytes of the firmware version differs between manuals (for a T-mini, 00 01 is 1.0). Commands that
+only some models have (low power, constant frequency, heartbeat, zero offset, pitch) are omitted.
 """
 
 from __future__ import annotations

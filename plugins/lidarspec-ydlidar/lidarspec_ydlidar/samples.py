@@ -27,21 +27,23 @@ class SampleFormat:
         groups: the sizes in bytes of the words into which the checksum divides a sample.
         correction: a function of the distance in metres that returns the degrees to add to the
             angle.
-        slowest: the scan frequency in Hz that is sent as the raw value 0.
+        lowest_frequency_hz: the scan frequency in Hz to which the raw value is added. It is the
+            value of the raw value 0, which also means that the frequency is unknown.
     """
 
     struct: Construct
     size: int = 2
     groups: tuple[int, ...] = (2,)
     correction: Callable[[Any], Any] | None = None
-    slowest: float = 0.0
+    lowest_frequency_hz: float = 0.0
     has_intensity: bool = False
 
 
 def camera_angle(distance: Any) -> Any:
-    """Return the angle in degrees between the laser's ray and the camera's ray.
+    """Return the angle in degrees between the laser beam and the ray to the image sensor.
 
-    Source: "angle second-level analysis".
+    Models that triangulate have an image sensor beside the laser. Source: YDLidar-SDK Communication
+    Protocol, angle second-level analysis.
     """
     mm = np.maximum(distance * 1000, 0.25)
     return np.where(distance > 0, np.rad2deg(np.arctan(21.8 * (155.3 - mm) / (155.3 * mm))), 0)
@@ -72,7 +74,7 @@ TRIANGLE_10 = SampleFormat(
     make_packed_sample("intensity" / BitsInteger(10)), 3, (1, 2), camera_angle, has_intensity=True
 )
 HALF = SampleFormat(make_plain_distance(0.0005), correction=camera_angle)
-TOF = SampleFormat(make_plain_distance(0.001), slowest=3.0)
+TOF = SampleFormat(make_plain_distance(0.001), lowest_frequency_hz=3.0)
 TOF_8 = SampleFormat(SAMPLE_8, 3, (1, 2), has_intensity=True)
 TOF_16 = SampleFormat(
     Struct("intensity" / Int16ul, "distance" / Scaled(Int16ul, 0.001, "m") * NO_RETURN_NOTE),
