@@ -153,15 +153,15 @@ def measure_core_share(pid: int, seconds: float) -> float:
     return (taken() - before) / (time.monotonic() - begin)
 
 
-def format_latency(left: list[int], came: list[tuple[int, int]]) -> str:
+def format_latency(sent_ns: list[int], received: list[tuple[int, int]]) -> str:
     """Return the median and the 99th percentile of the latency as text.
 
     Args:
-        left: the times at which the data was sent, in ns.
-        came: (time in ns, size) of each received message.
+        sent_ns: the times at which the data was sent, in ns.
+        received: (time in ns, size) of each received message.
     """
-    times = np.array(left)
-    after = np.array([at for at, _ in came if at > times[0]])
+    times = np.array(sent_ns)
+    after = np.array([at for at, _ in received if at > times[0]])
     which = np.searchsorted(times, after, side="right") - 1
     found = (after - times[which]) * 1e-6
     return (

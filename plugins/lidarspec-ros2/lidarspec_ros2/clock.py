@@ -34,12 +34,13 @@ class MessageStamps:
         self._wall = wall
         self._wall_step_ns = 0
 
-    def learn(self, device_ns: Times, host_ns: Times) -> None:
+    def update_conversion(self, device_ns: Times, host_ns: Times) -> None:
         """Update the conversion of the sensor's clock to the host's clock.
 
         Args:
             device_ns: the time of each packet by the sensor's clock, ns.
-            host_ns: the arrival time of each packet, ns; packets with the time 0 are ignored.
+            host_ns: the arrival time of each packet, ns; packets whose arrival time is 0 are
+                ignored.
         """
         is_known = host_ns > 0
         self.clock.observe(device_ns[is_known], host_ns[is_known])
@@ -48,7 +49,12 @@ class MessageStamps:
             self._wall_step_ns = step
 
     def stamp_scan(self, device_ns: int, host_ns: int, settings: Settings) -> int:
-        """Return the stamp of the next scan, ns."""
+        """Return the stamp of a scan, ns. Call this once for each scan, in order.
+
+        Args:
+            device_ns: the time of the scan's first point by the sensor's clock, ns.
+            host_ns: the arrival time of the packet with this point, ns.
+        """
         return self._choose_stamp(
             device_ns, self.clock.stamp(device_ns, host_ns), host_ns, settings
         )

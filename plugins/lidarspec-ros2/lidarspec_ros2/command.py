@@ -117,7 +117,10 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
     nodes = list[LidarNode]()
 
     def handle_signal(number: int, frame: object) -> None:
-        """Record the signal; interrupt the node only while it waits for a sensor."""
+        """Record the signal, for which `_serve` waits.
+
+        If a node waits for its sensor, also interrupt this wait.
+        """
         signals.append(number)
         if any(node.opening for node in nodes):
             raise KeyboardInterrupt

@@ -18,21 +18,22 @@ def make_status(
     name: str,
     device: Device,
     reading: MeterReading,
-    device_warnings: Sequence[str],
-    more: Mapping[str, str],
+    extra_warnings: Sequence[str],
+    extra_values: Mapping[str, str],
 ) -> DiagnosticStatus:
     """Return the state of a device for /diagnostics.
 
     Args:
         reading: the statistics of the last second.
-        device_warnings: warnings in addition to the warnings of the device.
+        extra_warnings: warnings in addition to the warnings of the device.
+        extra_values: values in addition to the state and the statistics, by name.
     """
-    warnings = [*device.warnings, *device_warnings]
+    warnings = [*device.warnings, *extra_warnings]
     figures = {f"{name} [{unit}]": text(reading) for name, unit, _, text in FIGURES}
     values = {
         "state": device.state,
         **figures,
-        **more,
+        **extra_values,
         **device.info,
         **{f"warning {n + 1}": text for n, text in enumerate(warnings)},
     }

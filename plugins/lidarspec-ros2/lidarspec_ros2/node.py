@@ -131,7 +131,7 @@ class LidarNode(LifecycleNode):
         self._services_of_sensor.clear()
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Open the sensor and start to read it."""
+        """Open the sensor and start to read it, without publishing."""
         self.failure = None
         try:
             self._open()
@@ -142,16 +142,16 @@ class LidarNode(LifecycleNode):
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start to publish."""
+        """Start to publish the scans, packets and IMU samples that are read."""
         self._was_lost = False
         if self._topics is not None:
-            self._topics.activate(active=True)
+            self._topics.set_active(active=True)
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop publishing, but continue to read, for commands and diagnostics."""
         if self._topics is not None:
-            self._topics.activate(active=False)
+            self._topics.set_active(active=False)
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -182,7 +182,7 @@ class LidarNode(LifecycleNode):
             self,
             settings,
             device.sensor,
-            played=not device.is_live,
+            is_file=not device.is_live,
             max_cloud_bytes=self._max_cloud_bytes,
         )
         packets.publish = topics.publish_packet
@@ -196,7 +196,10 @@ class LidarNode(LifecycleNode):
         self._thread.start()
 
     def _read(self, device: Device, topics: Topics) -> None:
-        """Publish scans, packets and IMU samples until the node stops or the input ends."""
+        """Read the device until the node stops or the input ends.
+
+        Scans and IMU samples are published while the node is active, the diagnostics always.
+        """
         speed = self._settings["replay_speed"]
         # `ahead=None`: all data that was read updates the clock before a scan is published.
         feed = LiveScans(device, played=speed > 0, speed=speed, ahead=None)
@@ -229,7 +232,7 @@ class LidarNode(LifecycleNode):
 
     def _publish(self, feed: LiveScans, topics: Topics) -> None:
         if feed.packets is not None and len(feed.packets):
-            topics.learn(feed.packets)
+            topics.update_conversion(feed.packets)
         topics.publish_imu(feed.device.imu_samples)
         for scan in feed.scans:
             if scan.whole:
@@ -239,18 +242,20 @@ class LidarNode(LifecycleNode):
         """Deactivate the node while a sensor that has sent data is disconnected."""
         is_lost = device.state in LOST_STATES and bool(device.stats.frames)
         if is_lost != self._was_lost and (self._was_lost or self._is_active):
-            self._run_in_executor(self._handle_loss if is_lost else self._handle_return)
+            self._run_in_executor(
+                self._handle_disconnection if is_lost else self._handle_reconnection
+            )
 
     @property
     def _is_active(self) -> bool:
         return self._topics is not None and self._topics.active
 
-    def _handle_loss(self) -> None:
+    def _handle_disconnection(self) -> None:
         if self._is_active:
             self.trigger_deactivate()
             self._was_lost = True
 
-    def _handle_return(self) -> None:
+    def _handle_reconnection(self) -> None:
         if self._was_lost:
             self.trigger_activate()
 
@@ -270,9 +275,9 @@ class LidarNode(LifecycleNode):
             "clock": describe_clock(report),
             "clock verdict": report.verdict.code,
             "clock drift [ppm]": f"{clock.drift_ppm:+.1f}",
-            "clock set": f"{clock.jumps} times",
+            "clock changed": f"{clock.jumps} times",
         }
-        warnings = [*filter(None, (describe_jump(clock), topics.fault))]
+        warnings = [*filter(None, (describe_jump(clock), topics.planar_scan_fault))]
         if self._settings["device_time_is_ros_time"] and report.verdict.is_fault:
             warnings.append(f"the sensor's clock: {report.verdict.text}; {report.verdict.advice}")
         status = make_status(self.get_name(), device, reading, warnings, more)
@@ -337,7 +342,7 @@ class LidarNode(LifecycleNode):
                 if not self.has_parameter(f"{name}.{argument}"):
                     text = (
                         f"Argument of the service {name}. A number without a unit is in the unit"
-                        " of the field."
+                        " of this argument."
                     )
                     self.declare_parameter(
                         f"{name}.{argument}",
@@ -373,11 +378,14 @@ class LidarNode(LifecycleNode):
 
 
 def _predict_scan_end(expected: float, feed: LiveScans) -> float:
-    """Return the time of the next search for a scan's end, by `time.monotonic`.
+    """Return the time shortly before the expected end of the next scan.
+
+    Until this time, the node need not look for the end of a scan. The time is by `time.monotonic`.
 
     Args:
-        expected: the time that was returned for the previous scan.
-        feed: the scans that were just read, which give the duration of a scan.
+        expected: the result of the previous call.
+        feed: the scans that were just read; the rate of a complete scan gives the duration of the
+            next scan.
     """
     now = time.monotonic()
     for scan in feed.scans:

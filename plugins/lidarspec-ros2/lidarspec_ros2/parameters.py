@@ -1,6 +1,6 @@
 """The parameters of the node, and a table to declare, check and document them.
 
-`Settings` has the values of the parameters in one configuration. The values are checked by the same
+`Settings` has the values of all parameters at one time. The values are checked by the same
 functions as the options of the command line, and with the same messages.
 """
 
@@ -33,7 +33,7 @@ class Parameter:
     Attributes:
         default: the default value, which also defines the type.
         low, high: the limits of a number.
-        live: whether the parameter can be changed while the node is configured.
+        live: whether a change takes effect without configuring the node again.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Parameter:
 #: Descriptions of the fields of `Mount`.
 _MOUNT_TEXTS = {
     **{
-        axis: f"Distance of the sensor {way} the origin of the carrier, metres."
+        axis: f"Distance of the sensor {way} the origin of the robot or vehicle, metres."
         for axis, way in (("x", "in front of"), ("y", "left of"), ("z", "above"))
     },
     **{
@@ -98,7 +98,7 @@ PARAMETERS = (
         "Publish the mount as the transform from parent_frame to frame_id on /tf_static, instead"
         " of transforming the points.",
     ),
-    Parameter("parent_frame", "base_link", "The frame_id of the carrier, for publish_tf."),
+    Parameter("parent_frame", "base_link", "The frame_id of the robot or vehicle, for publish_tf."),
     Parameter(
         "beams",
         0,
@@ -118,7 +118,8 @@ PARAMETERS = (
     Parameter(
         "angle_max",
         0.0,
-        "Last angle of each LaserScan, radians. If it is below angle_min, one revolution is added.",
+        "Last angle of each LaserScan, radians. If it is below angle_min, one revolution is added"
+        " to it, so that the angles can cross pi.",
         -10,
         10,
         live=True,
@@ -188,7 +189,8 @@ PARAMETERS = (
     Parameter(
         "device_time_is_ros_time",
         False,
-        "Stamp messages with the sensor's own time, which PTP or GPS must set.",
+        "Do not convert the time of the sensor's clock, because PTP or GPS sets this clock. Ignored"
+        " if use_device_time is false.",
         live=True,
     ),
     Parameter(
@@ -228,7 +230,8 @@ class Settings:
     """The values of the parameters, by name.
 
     Raises:
-        UsageError: if a value is invalid for all sensors.
+        UsageError: if a value is invalid for every sensor. Values that only some sensors accept
+            are checked later.
     """
 
     values: Mapping[str, Any]
@@ -256,7 +259,7 @@ class Settings:
         )
 
     def make_planar_scans(self) -> PlanarScans:
-        """Return the object that projects scans to planar scans."""
+        """Return a `PlanarScans`, which projects scans to planar scans as the parameters say."""
         first = self["angle_min"]
         width = (self["angle_max"] - self["angle_min"]) % (2 * math.pi)
         low = self["scan_z_min"]
@@ -267,8 +270,8 @@ class Settings:
             heights=(low, high) if low < high else None,
         )
 
-    def limit_ranges(self, planar: LaserScan) -> LaserScan:
-        """Return a planar scan with range limits narrowed by the parameters."""
+    def narrow_range_limits(self, planar: LaserScan) -> LaserScan:
+        """Return the planar scan with its declared range limits narrowed by the parameters."""
         far = min(planar.range_max, self["range_max"] or math.inf)
         return replace(planar, range_min=max(planar.range_min, self["range_min"]), range_max=far)
 
@@ -306,11 +309,12 @@ class Settings:
         device = find_device(self["source"])
         return None if device is None else device.mount
 
-    def open_device(self, record: Callable[[Transport], TrafficLog]) -> Device:
-        """Open the source of the parameters, and return the device.
+    def open_device(self, make_log: Callable[[Transport], TrafficLog]) -> Device:
+        """Open the source that the parameter `source` names, and return the device.
 
         Args:
-            record: a function that makes a log, which publishes the packets.
+            make_log: a function that returns the log for the received packets; called only if the
+                parameter `publish_packets` is set.
 
         Raises:
             LidarSpecError: if a parameter is invalid, or the source cannot be opened.
@@ -321,11 +325,11 @@ class Settings:
                 " sim:ID"
             )
         mount = None if self["publish_tf"] else self.find_mount()
-        record_to = record if self["publish_packets"] else None
+        record = make_log if self["publish_packets"] else None
         return Device(
             self["source"],
             self.find_sensor(),
-            record=record_to,
+            record=record,
             period=DECODING_PERIOD_S,
             mount=mount,
         )

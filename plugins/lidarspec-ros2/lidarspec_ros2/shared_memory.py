@@ -2,14 +2,16 @@
 
 Fast DDS passes messages to other processes on the same computer in a segment of shared memory,
 which the publisher owns. The segment has 512 KiB, unless a profile sets another size. A cloud of
-several megabytes is sent in fragments, which overwrite each other in this segment. Most of these
-clouds are lost if subscribers use the reliability "best effort". The node therefore provides a
-profile with a larger segment.
+several megabytes does not fit into this segment: it is sent in fragments, and later fragments
+overwrite fragments that were not read yet. Most of these clouds are lost if subscribers use the
+reliability "best effort". The node therefore provides a profile with a larger segment.
 
 An environment variable names the file with the profile. Fast DDS reads this file once, when the
-first participant of a process is created. `use_profile` sets the variable only for that time.
+first participant of a process is created. `use_profile` is a context manager that sets the variable
+while the node creates this participant.
 
-The profile lists the transports that Fast DDS uses by default, shared memory and UDP.
+A profile replaces the default transports of Fast DDS, so it has to list them: shared memory and
+UDP.
 """
 
 from __future__ import annotations
@@ -127,8 +129,9 @@ def _fit_segment(cloud_bytes: int | None, free: int) -> SharedMemory:
                 else " (assumed, because the size of this sensor's clouds is unknown)"
             )
             notice = (
-                f"Fast DDS uses {format_megabytes(segment_bytes)} of shared memory, for clouds of"
-                f" up to {size}{reason}; set {find_profile_variable()} to use another profile"
+                f"Fast DDS was configured to use {format_megabytes(segment_bytes)} of shared"
+                f" memory, for clouds of up to {size}{reason}; to use your own profile instead, set"
+                f" {find_profile_variable()} to the path of its file"
             )
             return SharedMemory(segment_bytes, segment_bytes // MIN_CLOUDS, notice)
     warning = (
@@ -172,7 +175,9 @@ def find_profile_variable() -> str:
 
 
 def find_largest_cloud_bytes(sensor: Sensor) -> int | None:
-    """Return the size of a sensor's largest cloud in bytes; None if the spec is incomplete.
+    """Return the size of a sensor's largest cloud in bytes, calculated from simulated packets.
+
+    The result is None if the description of the sensor does not contain the rate of its packets.
 
     Raises:
         LidarSpecError: if the sensor cannot be simulated.

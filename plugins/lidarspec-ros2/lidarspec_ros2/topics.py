@@ -54,13 +54,14 @@ class Topics:
     """The topics of one sensor.
 
     Args:
-        played: whether a file is played; its time is published on /clock if `use_sim_time` is set.
+        is_file: whether a file is played. The stamps of its scans are then published on /clock if
+            `use_sim_time` is set.
         max_cloud_bytes: the largest cloud that reaches subscribers with the reliability "best
             effort", in bytes; None if unknown.
 
     Attributes:
         sent: the number of published messages, by topic.
-        fault: the reason why the requested planar scan cannot be made; "" if it can.
+        planar_scan_fault: the reason why the requested planar scan cannot be made; "" if it can.
         latency_s: seconds from the arrival of the last packets of a scan to its publication.
 
     Raises:
@@ -73,13 +74,13 @@ class Topics:
         settings: Settings,
         sensor: Sensor,
         *,
-        played: bool,
+        is_file: bool,
         max_cloud_bytes: int | None = None,
     ) -> None:
         self._max_cloud_bytes = max_cloud_bytes
         self._node = node
         self._sensor = sensor
-        self.stamps = MessageStamps(None if played else HostClock())
+        self.stamps = MessageStamps(None if is_file else HostClock())
         self._messages = RosMessages("ROS2_HUMBLE")
         self._reliability = (
             ReliabilityPolicy.RELIABLE
@@ -92,7 +93,7 @@ class Topics:
         self._plain_publishers = list[Any]()
         self.active = False
         self.latency_s = 0.0
-        self.fault = ""
+        self.planar_scan_fault = ""
         self._arrival_ns = 0
         self.use_settings(settings)
         self._get_publisher(CLOUD)
@@ -105,7 +106,7 @@ class Topics:
             self._publish_transform(settings)
         self._clock_publisher = (
             self._make_plain_publisher(Clock, "/clock", 10)
-            if played and node.get_parameter("use_sim_time").value
+            if is_file and node.get_parameter("use_sim_time").value
             else None
         )
 
@@ -115,10 +116,10 @@ class Topics:
         self._planar_scans = settings.make_planar_scans()
         self._selector = ScanSelector(settings.make_selection())
 
-    def learn(self, packets: Packets) -> None:
+    def update_conversion(self, packets: Packets) -> None:
         """Update the conversion of the sensor's clock with the times of packets."""
         self._arrival_ns = int(packets.host_ns[0]) or self._arrival_ns
-        self.stamps.learn(packets.time_ns, packets.host_ns)
+        self.stamps.update_conversion(packets.time_ns, packets.host_ns)
 
     def publish(self, scan: Scan) -> None:
         """Publish a scan on the topics with subscribers."""
@@ -131,14 +132,16 @@ class Topics:
             self._send(self._messages.cloud(selected, stamp, every_point=organised))
         try:
             planar = self._planar_scans.project(selected)
-            self.fault = ""
+            self.planar_scan_fault = ""
         except UsageError as error:  # a ring that the sensor lacks: it is set at run time
             planar = None
-            self.fault = str(error)
+            self.planar_scan_fault = str(error)
         if planar is not None and self._has_subscribers(SCAN):
             self._send(
                 self._messages.laserscan(
-                    selected, settings.limit_ranges(planar), stamp + planar.stamp_ns - scan.stamp_ns
+                    selected,
+                    settings.narrow_range_limits(planar),
+                    stamp + planar.stamp_ns - scan.stamp_ns,
                 )
             )
         self.latency_s = (time.time_ns() - self._arrival_ns) / 1e9
@@ -160,8 +163,8 @@ class Topics:
         if self._has_subscribers(RAW):
             self._send(self._messages.raw(chunk, datagram=self._sensor.datagrams))
 
-    def activate(self, *, active: bool) -> None:
-        """Start or stop publishing."""
+    def set_active(self, *, active: bool) -> None:
+        """Start to publish if `active`, otherwise stop."""
         with self._publishing:
             self.active = active
             for publisher in self._publishers.values():
@@ -236,8 +239,8 @@ class Topics:
         self._max_cloud_bytes = None
         self._node.get_logger().warning(
             f"clouds of {format_megabytes(size)} may be lost, because the shared memory was made"
-            f" for clouds of up to {format_megabytes(limit)}; set the parameter sensor when the"
-            " node starts, or set qos:=reliable"
+            f" for clouds of up to {format_megabytes(limit)}; start the node with the parameter"
+            " sensor, so that it knows the size of the clouds, or set qos:=reliable"
         )
 
 

@@ -65,7 +65,7 @@ def make_stamps(wall: HostClock | None = None, **wanted: Any) -> NDArray[np.int6
     found = []
     for at in range(0, 10 * SECOND, SECOND // 10):
         arrived = at + BEGAN + 3_000_000
-        stamps.learn(np.array([at]), np.array([arrived]))
+        stamps.update_conversion(np.array([at]), np.array([arrived]))
         found.append(stamps.stamp_scan(at, arrived, values) - at - BEGAN)
     assert (
         abs(stamps.stamp_sample(5 * SECOND, values, by_clock=True) - 5 * SECOND - BEGAN - found[-1])
