@@ -2,8 +2,9 @@
 
 Each request must have the token of the server in its query. Other users of this computer can
 connect to the server, but do not know the token. The token is not kept in a cookie, because
-browsers send the cookies of one port to all ports of this computer. The checks of the headers Host
-and Origin refuse requests from other pages in the same browser.
+browsers send the cookies of one port to all ports of this computer, so a server of another user
+could receive the token. The checks of the headers Host and Origin refuse requests from other pages
+in the same browser.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ HEADERS = {
     "cross-origin-resource-policy": "same-origin",
     "cache-control": "no-store",
 }
-OTHER_HOST = "this server has another host name: open the link that lidarspec printed"
+OTHER_HOST = "the address names another host than this server: open the link that lidarspec printed"
 OTHER_PAGE = "the request was refused, because it comes from another page"
 TOKEN_NEEDED = """<!doctype html>
 <html lang="en">
@@ -64,8 +65,9 @@ class Guard:
 
     Args:
         host: address on which the server listens.
-        name: the host in the printed link.
-        admit: called with the client of each request that has the token.
+        link_host: the host in the printed link.
+        on_token: called for each request that has the token, with the client's address and port;
+            None if they are unknown.
     """
 
     def __init__(
@@ -73,16 +75,16 @@ class Guard:
         app: ASGIApp,
         *,
         host: str,
-        name: str,
+        link_host: str,
         port: int,
         token: str,
-        admit: Callable[[tuple[str, int] | None], None],
+        on_token: Callable[[tuple[str, int] | None], None],
     ) -> None:
         self._app = app
-        self._admit = admit
+        self._on_token = on_token
         self._port = port
         self._token = token.encode()
-        self._names = {*LOCAL_NAMES, name.lower()}
+        self._names = {*LOCAL_NAMES, link_host.lower()}
         self._is_anywhere = host in ANY_ADDRESS
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -102,7 +104,7 @@ class Guard:
         if refusal is not None:
             await refusal(scope, receive, send_with_headers)
             return
-        self._admit(scope["client"])
+        self._on_token(scope["client"])
         # The application does not see the token, so that it is in no log and no message.
         await self._app({**scope, "query_string": b""}, receive, send_with_headers)
 
@@ -154,8 +156,8 @@ def add_token(page: str, token: str) -> str:
     return _OWN_FILE.sub(rf"\1?token={token}", page)
 
 
-def write_opening_page(folder: Path, link: str) -> Path:
-    """Write a page that redirects to the link, and return its path."""
+def write_redirect_page(folder: Path, link: str) -> Path:
+    """Write a page that redirects a browser to the link, and return the path of the page."""
     # Only the user can read the page. Other users can see the command lines of all programs, so a
     # browser is not started with the link.
     path = folder / "open.html"

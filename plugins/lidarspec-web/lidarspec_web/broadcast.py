@@ -1,8 +1,8 @@
 """Read a source once, and show it to any number of viewers.
 
 One thread reads the source (`run`). Other threads use the newest scan, the statistics, and the
-newest bytes. A file is played: it can be paused, read from another position, or played at another
-speed, which affects all viewers. Viewers do not affect a live source.
+newest bytes. Each viewer, for example a page, can pause a file, continue the file at another
+position, or change its speed; this affects all viewers. Viewers do not affect a live source.
 
 Other threads only store their requests (`seek`, `step`, `play`). The reading thread performs them
 in the next pass of its loop.
@@ -43,17 +43,17 @@ class ShownScan:
     """A scan that viewers show.
 
     Attributes:
-        number: number of the shown scan, from 0.
-        position: seconds from the first scan of the source.
-        sent: arrival time of the last packet of the scan, seconds since 1970. For a file, it is the
-            time at which the scan was shown.
+        number: number of the shown scan, counted from 0.
+        position: the time of the scan, in seconds after the first scan of the source.
+        arrival: the arrival time of the scan's last packet, in seconds since 1970. For a file, it
+            is the time at which the scan was read from the file.
     """
 
-    def __init__(self, scan: Scan, number: int, position: float, sent: float) -> None:
+    def __init__(self, scan: Scan, number: int, position: float, arrival: float) -> None:
         self.scan = scan
         self.number = number
         self.position = position
-        self.sent = sent
+        self.arrival = arrival
         self._message = b""
         self._message_max_points = -1
 
@@ -64,7 +64,7 @@ class ShownScan:
                 self.scan,
                 self.number,
                 position=self.position,
-                sent=self.sent,
+                arrival=self.arrival,
                 max_points=max_points,
             )
             self._message_max_points = max_points
@@ -76,7 +76,7 @@ class Broadcast:
 
     Args:
         reopen: a function that opens the source again; called to seek in a file.
-        switch: starts and stops recordings of a live source; None for a file.
+        switch: the object that starts and stops recordings of a live source; None for a file.
 
     Attributes:
         shown: the newest scan; None before the first scan.
@@ -86,7 +86,7 @@ class Broadcast:
         clock: a description of the sensor's clock; "" if the sensor sends no time.
         history: the statistics of the last minute, one dict for each second.
         failure: the error that ended the reading; None if there was no error.
-        news: a function that the reading thread calls when there is something new to show.
+        on_news: a function that the reading thread calls when there is something new to show.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Broadcast:
         self.clock = ""
         self.history = deque[dict[str, Any]](maxlen=round(HISTORY_S / FIGURES_PERIOD_S))
         self.failure: LidarSpecError | None = None
-        self.news: Callable[[], None] = lambda: None
+        self.on_news: Callable[[], None] = lambda: None
         self._reopen = reopen
         self._select = select or Selection()
         self._clock = HostClock()
@@ -160,14 +160,14 @@ class Broadcast:
         return self.failure is not None or self._has_ended
 
     @property
-    def ending(self) -> str:
-        """The reason why there are no more scans."""
+    def end_reason(self) -> str:
+        """The reason why there are no more scans, if `has_ended`."""
         if self.failure is not None:
             return str(self.failure)
         return "; ".join([f"{self.source} has ended", *self.warnings])
 
     @property
-    def began_ns(self) -> int:
+    def start_ns(self) -> int:
         """The arrival time of the first scan's first packet, ns since 1970; 0 if unknown."""
         if self._first_scan is None:
             return 0
@@ -187,7 +187,7 @@ class Broadcast:
         Raises:
             UsageError: if the source is live.
         """
-        self._refuse_live("each page can only pause its own view")
+        self._refuse_live("it cannot be paused, but each page can pause its own view")
         self.paused = True
 
     def play(self) -> None:
@@ -208,32 +208,34 @@ class Broadcast:
         Raises:
             UsageError: if the source is live.
         """
-        self._refuse_live("the next scan cannot be selected, because it has not arrived yet")
+        self._refuse_live("the next scan cannot be shown, because it has not arrived yet")
         self.paused = True
         self._steps += 1
         self._has_request.set()
 
-    def seek(self, to: float) -> None:
-        """Continue a file at the time `to`, in seconds from its first scan.
+    def seek(self, position: float) -> None:
+        """Continue a file at a position, in seconds after its first scan.
 
         Raises:
             UsageError: if the source does not support seeking.
         """
         if not self.can_seek:
             raise UsageError(f"cannot seek in {self.source}")
-        self._seek_target = max(to, 0.0)
+        self._seek_target = max(position, 0.0)
         self._has_request.set()
 
-    def play_at(self, times: float) -> None:
+    def set_speed(self, factor: float) -> None:
         """Play a file at a multiple of its recorded speed.
 
         Raises:
             UsageError: if the source is live, or the speed is out of range.
         """
         self._refuse_live("the speed cannot be changed")
-        if not MIN_SPEED <= times <= MAX_SPEED:
-            raise UsageError(f"expected a speed from {MIN_SPEED:g} to {MAX_SPEED:g}, got {times:g}")
-        self.speed = times
+        if not MIN_SPEED <= factor <= MAX_SPEED:
+            raise UsageError(
+                f"expected a speed from {MIN_SPEED:g} to {MAX_SPEED:g}, got {factor:g}"
+            )
+        self.speed = factor
 
     def run(self, until: float) -> None:
         """Read until a time of `time.monotonic`, or until `stop`.
@@ -247,7 +249,7 @@ class Broadcast:
                 self._update()
         except LidarSpecError as error:
             self.failure = error
-            self.news()
+            self.on_news()
             raise
 
     def stop(self) -> None:
@@ -315,7 +317,7 @@ class Broadcast:
         if self._update_end():
             has_news = True
         if has_news:
-            self.news()
+            self.on_news()
 
     def _update_scan(self) -> bool:
         """Update the shown scan, and return whether there is a new scan."""
@@ -362,7 +364,7 @@ class Broadcast:
         now = self.now()
         latency_s = None
         if self.is_live and self.shown is not None:
-            latency_s = now - self.shown.sent
+            latency_s = now - self.shown.arrival
         clock = self._feed.clock.report()
         if self.device.sensor.clock is not None:
             self.clock = describe_clock(clock)

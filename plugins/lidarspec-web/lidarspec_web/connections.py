@@ -1,8 +1,9 @@
 """Limits on connections to the server, so that it stays reachable.
 
-A connection is pending until one of its requests has the token. A pending connection is closed if
-this takes too long. The oldest pending connection is closed if there are too many connections. Idle
-connections of other users therefore never block a browser, which sends its request at once.
+A connection is pending until one of its requests has the token. A pending connection is closed
+after `TOKEN_TIMEOUT_S`. If a connection is opened when there are `MAX_CONNECTIONS` already, the
+oldest pending connection is closed. A browser sends its first request immediately, so its
+connection is pending only for a moment, and idle connections of other users do not block it.
 """
 
 from __future__ import annotations
@@ -119,8 +120,8 @@ class Connections:
         if not self._has_reported:
             self._has_reported = True
             self._report(
-                f"there are more than {MAX_CONNECTIONS} connections; connections without the"
-                " token are closed first"
+                f"there are more than {MAX_CONNECTIONS} connections; for each new connection, the"
+                " oldest connection without the token is closed"
             )
 
     def _close_waiting(self, client: Client) -> None:

@@ -81,7 +81,11 @@ class OpenPage:
         self._frame_due = math.inf
 
     async def serve(self) -> str:
-        """Serve the page until it is closed, and return the reason why it was closed."""
+        """Serve the page until it is closed.
+
+        Returns:
+            How the page was closed, as a text that follows the name of the page.
+        """
         await self._socket.accept()
         works = (
             self._receive_requests(),
@@ -115,7 +119,7 @@ class OpenPage:
                 elif not await self._send_in_time(message):
                     return "was disconnected, because it stopped reading"
         except WebSocketDisconnect:
-            return "closed"
+            return "was closed"
 
     async def _send_in_time(self, message: bytes | dict[str, Any]) -> bool:
         """Send a message, and return whether the page reads it in time."""
@@ -173,7 +177,7 @@ class OpenPage:
         is_new = has_ended and not self._sent_end
         self._sent_end = has_ended
         if is_new:
-            return {"is": "ended", "text": self._broadcast.ending}
+            return {"is": "ended", "text": self._broadcast.end_reason}
         return None
 
     async def _make_frame_message(self) -> dict[str, Any] | None:
@@ -204,8 +208,8 @@ class OpenPage:
         is_frozen = self._frozen is not None
         state = self._answers.state(
             frozen=is_frozen,
-            since=self._sent_damaged,
-            at=self._held[-1] if is_frozen else None,
+            first_damaged=self._sent_damaged,
+            paused_at=self._held[-1] if is_frozen else None,
         )
         self._sent_damaged = state["damaged"]["total"]
         return state
@@ -243,8 +247,8 @@ class OpenPage:
             while self._is_busy:
                 await asyncio.sleep(BUSY_CHECK_S)
         if message.get("code") in CLOSE_CODES:
-            return "closed"
-        return "was disconnected, because it stopped replying"
+            return "was closed"
+        return "was disconnected, because its connection failed or it did not answer pings"
 
     @property
     def _is_busy(self) -> bool:
@@ -332,7 +336,7 @@ class OpenPage:
         self._broadcast.seek(_read_number(request, "to", 0.0, MAX_NUMBER))
 
     def _set_speed(self, request: Mapping[str, Any]) -> None:
-        self._broadcast.play_at(_read_number(request, "times", 0.0, MAX_NUMBER))
+        self._broadcast.set_speed(_read_number(request, "times", 0.0, MAX_NUMBER))
 
     def _watch(self, request: Mapping[str, Any]) -> None:
         self._shows_frames = request.get("frames") is True
@@ -349,7 +353,7 @@ class OpenPage:
             index = round(_read_number(point, "index", 0, MAX_POINTS))
             shown = next((held for held in self._held if held.number == scan), None)
             self._reply_later(
-                "frame", lambda: self._answers.find_origin(shown, scan, index, backlog)
+                "frame", lambda: self._answers.find_point_frame(shown, scan, index, backlog)
             )
         elif "damaged" in request:
             number = round(_read_number(request, "damaged", 0, MAX_NUMBER))
@@ -383,7 +387,7 @@ class OpenPage:
                 switch.toggle()
             else:
                 switch.set_state(on=on)
-            self._broadcast.news()
+            self._broadcast.on_news()
 
         self._reply_later("record", change)
 

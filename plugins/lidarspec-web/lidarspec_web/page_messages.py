@@ -68,18 +68,20 @@ class PageMessages:
             "version": __version__,
         }
 
-    def state(self, *, frozen: bool, since: int, at: ShownScan | None = None) -> dict[str, Any]:
+    def state(
+        self, *, frozen: bool, first_damaged: int, paused_at: ShownScan | None = None
+    ) -> dict[str, Any]:
         """Return the state of the source.
 
         Args:
-            frozen: whether the page has paused a live source.
-            since: the number of `DamagedBytes` that the page has received so far.
-            at: the scan at which the page is paused; by default the newest scan.
+            frozen: whether the page has paused its own view of a live source.
+            first_damaged: the number of the first `DamagedBytes` that the page does not have yet.
+            paused_at: the scan at which the page is paused; None for the newest scan.
         """
         broadcast = self.broadcast
         switch = broadcast.switch
-        shown = at or broadcast.shown
-        damaged = self._list_damaged(since)
+        shown = paused_at or broadcast.shown
+        damaged = self._list_damaged(first_damaged)
         warnings = list(broadcast.warnings)
         recording = None
         if switch is not None:
@@ -102,7 +104,7 @@ class PageMessages:
             "recording": recording,
             # The next list begins at this total, so a piece that arrived meanwhile does not count.
             "damaged": {
-                "total": damaged[-1]["number"] + 1 if damaged else since,
+                "total": damaged[-1]["number"] + 1 if damaged else first_damaged,
                 "newest": damaged,
             },
         }
@@ -138,10 +140,17 @@ class PageMessages:
             return _make_discarded_reply(f"frame {number}")
         return self.frame(stored, "number")
 
-    def find_origin(
+    def find_point_frame(
         self, shown: ShownScan | None, number: int, index: int, backlog: RecentBytes
     ) -> dict[str, Any]:
-        """Return the frame that contained a point, and the path of the point's field."""
+        """Return the explained frame that contained a point, and the path of the point's row.
+
+        Args:
+            shown: the scan of the point; None if the scan is no longer stored.
+            number: the number of the scan.
+            index: the index of the point in the scan.
+            backlog: the stored frames.
+        """
         if shown is None or index >= len(shown.scan):
             return _make_discarded_reply(f"point {index} of scan {number}")
         point_origin = shown.scan.provenance(index)
@@ -151,7 +160,7 @@ class PageMessages:
         return self.frame(stored, "point", point_origin)
 
     def find_damaged(self, number: int, backlog: RecentBytes) -> dict[str, Any]:
-        """Return damaged bytes by their number, with changes that explain the damage."""
+        """Return damaged bytes by their number, with an explanation of the damage."""
         piece = backlog.find_damaged(number)
         if piece is None:
             return _make_discarded_reply(f"damaged piece {number}")
@@ -204,17 +213,17 @@ class PageMessages:
         return explain(data, self.broadcast.device.sensor, frame)
 
     def _make_verdict(self, piece: DamagedBytes) -> str:
-        return piece.verdict(self.broadcast.device.sensor)
+        return piece.describe_fault(self.broadcast.device.sensor)
 
     def _find_position(self, at: int) -> float | None:
         """Return the seconds from the first scan to the arrival time `at`."""
-        began_ns = self.broadcast.began_ns
-        if at <= 0 or not began_ns:
+        start_ns = self.broadcast.start_ns
+        if at <= 0 or not start_ns:
             return None
-        return (at - began_ns) * 1e-9
+        return (at - start_ns) * 1e-9
 
-    def _list_damaged(self, since: int) -> list[dict[str, Any]]:
-        """Return the newest damaged bytes whose number is at least `since`."""
+    def _list_damaged(self, first: int) -> list[dict[str, Any]]:
+        """Return the newest damaged bytes whose number is at least `first`."""
         backlog = self.broadcast.backlog
         return [
             {
@@ -224,7 +233,7 @@ class PageMessages:
                 "size": piece.size,
                 "verdict": self._verdict(piece),
             }
-            for piece in backlog.list_damaged(max(since, backlog.damaged - MAX_DAMAGED_LISTED))
+            for piece in backlog.list_damaged(max(first, backlog.damaged - MAX_DAMAGED_LISTED))
         ]
 
 

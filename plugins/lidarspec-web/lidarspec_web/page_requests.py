@@ -44,13 +44,13 @@ class RateLimit:
     """Calculates how long to delay messages that arrive faster than allowed.
 
     Args:
-        at_once: number of messages that a page may send at once after a pause.
+        burst: number of messages that are not delayed after a pause, however fast they arrive.
         per_second: allowed number of messages per second.
     """
 
-    def __init__(self, at_once: int, per_second: float) -> None:
+    def __init__(self, burst: int, per_second: float) -> None:
         self._period_s = 1 / per_second
-        self._burst_s = at_once / per_second
+        self._burst_s = burst / per_second
         self._due = 0.0
 
     def delay_s(self, now: float) -> float:

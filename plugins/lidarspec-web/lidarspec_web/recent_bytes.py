@@ -38,10 +38,10 @@ class DamagedBytes:
     """Consecutive bytes of the input that are not in valid frames: a damaged piece.
 
     Attributes:
-        number: number of the damaged piece, from 0.
+        number: number of the damaged piece, counted from 0.
         offset: offset in the input.
         at: arrival time of the frame after these bytes, ns since 1970; -1 if it is unknown.
-        data: the bytes; if there are too many, only the first.
+        data: the bytes, but at most the first `MAX_DAMAGED_BYTES`.
         is_datagram: whether the bytes are one whole datagram.
     """
 
@@ -52,8 +52,8 @@ class DamagedBytes:
     data: bytes
     is_datagram: bool
 
-    def verdict(self, sensor: Sensor) -> str:
-        """Return the fault of the bytes in one sentence."""
+    def describe_fault(self, sensor: Sensor) -> str:
+        """Return a text that says why the bytes are not a valid frame."""
         if not self.data:
             return "the message is incomplete, because datagrams are missing"
         try:
@@ -68,8 +68,8 @@ class StoredFrame:
     """A frame that a page can explain.
 
     Attributes:
-        number: number of the frame, from 0; None if the bytes are from a scan, not from the
-            backlog.
+        number: number of the frame, counted from 0; None if `RecentBytes` no longer has the frame,
+            so that the bytes are from the scan of a point.
         at: arrival time, ns since 1970; -1 if it is unknown.
     """
 
@@ -81,13 +81,14 @@ class StoredFrame:
 
 @dataclass(frozen=True)
 class _DecoderInput:
-    """One input of the decoder.
+    """The bytes that the decoder received in one call.
 
     Attributes:
-        offset: offset of the first byte in the whole input.
-        buffer: an array with the bytes of this input, and possibly further bytes.
+        offset: offset of the first of these bytes, counted from the start of the source.
+        buffer: an array with these bytes, and possibly further bytes.
         starts: the offset of each part in the buffer. A stream has one part; otherwise, each
             datagram is a part.
+        sizes: the number of bytes of each part.
     """
 
     offset: int
@@ -102,7 +103,7 @@ class _DecoderInput:
 
 @dataclass(frozen=True)
 class _FoundFrames:
-    """The frames in one input of the decoder, and the number of the first frame."""
+    """The frames that the decoder found in one call, and the number of the first frame."""
 
     first_number: int
     frames: Frames

@@ -52,8 +52,8 @@ class ScanSaver:
         self._writing = asyncio.Lock()
         self._rests_until = 0.0
 
-    def response(self, shown: ShownScan, suffix: str) -> Response:
-        """Return the response that writes and sends a scan."""
+    def make_response(self, shown: ShownScan, suffix: str) -> Response:
+        """Return an HTTP response that writes the scan to a file and sends it when it is served."""
         return _SavedScan(self, shown, suffix)
 
     async def serve(

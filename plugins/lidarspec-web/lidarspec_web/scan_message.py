@@ -4,7 +4,8 @@ The message consists of, in this order:
 
 1. the length of the header, 4 bytes, little-endian;
 2. the header in JSON, padded with spaces so that the message so far is a multiple of 8 bytes;
-3. each column that the header names, as in memory, padded with zeros to a multiple of 8 bytes.
+3. each column that the header names, as a little-endian array, padded with zeros to a multiple of
+   8 bytes.
 
 Because of the padding, the page can use typed arrays on the received bytes without copying them.
 """
@@ -33,14 +34,15 @@ _GOLDEN_SECTION = (math.sqrt(5) - 1) / 2
 
 
 def make_scan_message(
-    scan: Scan, number: int, *, position: float, sent: float, max_points: int
+    scan: Scan, number: int, *, position: float, arrival: float, max_points: int
 ) -> bytes:
     """Return a scan as a message, without points that have no return.
 
     Args:
         number: number of the scan; the page uses it to request the frame of a point.
-        position: time of the first point, seconds since the first packet of the source.
-        sent: arrival time of the last packet, seconds since 1970 by this computer's clock.
+        position: the time of the scan, in seconds after the first scan of the source.
+        arrival: the arrival time of the scan's last packet, in seconds since 1970 by this
+            computer's clock; the message contains this time as `sent`.
         max_points: maximum number of points. If there are more points, evenly distributed points
             are selected.
     """
@@ -54,7 +56,7 @@ def make_scan_message(
     header = {
         "scan": number,
         "position": position,
-        "sent": sent,
+        "sent": arrival,
         "points": len(indices),
         "of": len(returns),
         "whole": scan.whole,

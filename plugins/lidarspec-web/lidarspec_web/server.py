@@ -24,7 +24,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from lidarspec import SourceError
-from lidarspec_web.access import ANY_ADDRESS, Guard, add_token, make_token, write_opening_page
+from lidarspec_web.access import ANY_ADDRESS, Guard, add_token, make_token, write_redirect_page
 from lidarspec_web.broadcast import Broadcast
 from lidarspec_web.connections import BACKLOG, Connections, ErrorReporter
 from lidarspec_web.open_page import SEND_TIMEOUT_S, OpenPage, describe_bug
@@ -82,16 +82,16 @@ class PageSite:
         self._saves = ScanSaver(self._folder, self._workers.saves, self._connections.drop)
         self._socket = _listen(host, port)
         self._token = make_token()
-        name = _find_link_host(host)
+        link_host = _find_link_host(host)
         port = self._socket.getsockname()[1]
-        self.link = f"http://{name}:{port}/?token={self._token}"
+        self.link = f"http://{link_host}:{port}/?token={self._token}"
         guard = Guard(
             self._make_app(),
             host=host,
-            name=name,
+            link_host=link_host,
             port=port,
             token=self._token,
-            admit=self._connections.admit,
+            on_token=self._connections.admit,
         )
         self._server = uvicorn.Server(self._make_config(guard))
         self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()), name="pages")
@@ -131,7 +131,7 @@ class PageSite:
         Raises:
             OSError: if the file cannot be written.
         """
-        return write_opening_page(self._folder.path, self.link).as_uri()
+        return write_redirect_page(self._folder.path, self.link).as_uri()
 
     def __enter__(self) -> Self:
         remove_stale_folders()
@@ -144,7 +144,7 @@ class PageSite:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._broadcast.news = lambda: None
+        self._broadcast.on_news = lambda: None
         self._server.should_exit = True
         self._thread.join()
         self._workers.close()
@@ -157,7 +157,7 @@ class PageSite:
         def notify() -> None:
             loop.call_soon_threadsafe(self._notify_pages)
 
-        self._broadcast.news = notify
+        self._broadcast.on_news = notify
         loop.set_exception_handler(ErrorReporter(self._report))
         watching = asyncio.create_task(self._connections.watch())
         await self._server.serve(sockets=[self._socket])
@@ -182,12 +182,12 @@ class PageSite:
         self._opened_count += 1
         number = self._opened_count
         client = "an unknown address" if socket.client is None else socket.client.host
-        self._report(f"page {number} opened by {client}; open pages: {len(self._open_pages)}")
-        ending = "closed"
+        self._report(f"page {number} was opened by {client}; open pages: {len(self._open_pages)}")
+        ending = "was closed"
         try:
             ending = await page.serve()
         except Exception as error:
-            ending = f"closed: {describe_bug(error)}"
+            ending = f"was closed because of {describe_bug(error)}"
         finally:
             self._open_pages.discard(page)
             self._report(f"page {number} {ending}; open pages: {len(self._open_pages)}")
@@ -206,7 +206,7 @@ class PageSite:
             return PlainTextResponse(
                 "this scan is no longer available: pause the view before saving", 404
             )
-        return self._saves.response(shown, suffix)
+        return self._saves.make_response(shown, suffix)
 
 
 def _find_link_host(host: str) -> str:

@@ -87,7 +87,7 @@ class SourceServer:
 
     @property
     def trouble(self) -> str:
-        """The error of the last recording; "" if there was none."""
+        """The error of the last recording; "" if there was no error or no recording."""
         if self.switch is None:
             return ""
         return self.switch.trouble

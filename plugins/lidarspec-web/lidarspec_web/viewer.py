@@ -110,7 +110,7 @@ class Viewer:
         device = open_device(self._source, self._sensor, period=LOOK_S)
         reopen = functools.partial(open_device, self._source, device.sensor)
         with Broadcast(self._source, device, reopen=reopen, select=self._select) as broadcast:
-            broadcast.news = self._send_news
+            broadcast.on_news = self._send_news
             self._answers = PageMessages(broadcast, control=False)
             self._broadcast = broadcast
             if not self._is_closed:
@@ -154,7 +154,7 @@ class Viewer:
         now = time.monotonic()
         if now >= self._state_due:
             self._state_due = now + STATE_PERIOD_S
-            self._send(answers.state(frozen=False, since=broadcast.backlog.damaged))
+            self._send(answers.state(frozen=False, first_damaged=broadcast.backlog.damaged))
         if self._wanted_points and shown.number != self._sent_scan:
             max_points = self._wanted_points
             self._wanted_points = 0

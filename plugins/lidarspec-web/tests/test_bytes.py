@@ -239,8 +239,8 @@ def test_a_piece_that_arrives_while_a_state_is_made_is_listed_once(
         page.until("ended")
         answers = PageMessages(station.broadcast, control=False)
         monkeypatch.setattr(RecentBytes, "list_damaged", list_after_another)
-        first = answers.state(frozen=False, since=0)["damaged"]
-        second = answers.state(frozen=False, since=first["total"])["damaged"]
+        first = answers.state(frozen=False, first_damaged=0)["damaged"]
+        second = answers.state(frozen=False, first_damaged=first["total"])["damaged"]
     last = first["newest"][-1]["number"]
     assert [piece["number"] for piece in second["newest"]] == [last + 1]
     assert second["total"] == last + 2

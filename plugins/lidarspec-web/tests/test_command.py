@@ -69,8 +69,8 @@ def test_it_prints_its_link_and_ends_on_a_signal(tmp_path: Path, by: signal.Sign
         code, out, lines = wait_until_end(running, by)
     assert (code, out) == (130, "")
     assert lines == [
-        "page 1 opened by 127.0.0.1; open pages: 1",
-        "page 1 closed; open pages: 0",
+        "page 1 was opened by 127.0.0.1; open pages: 1",
+        "page 1 was closed; open pages: 0",
         "interrupted",
     ]
     assert [path.name for path in tmp_path.iterdir()] == ["page"]

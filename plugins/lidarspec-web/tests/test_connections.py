@@ -61,7 +61,8 @@ def test_idle_connections_make_way_for_a_page(station: Station) -> None:
                 assert page.scan()[1]["x"].size
     told = [text for text in station.said if not text.startswith("page ")]
     assert told == [
-        "there are more than 8 connections; connections without the token are closed first"
+        "there are more than 8 connections; for each new connection, the oldest connection without"
+        " the token is closed"
     ]
 
 

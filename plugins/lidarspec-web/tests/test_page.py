@@ -20,7 +20,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.simulation.scenes import Room
 from lidarspec.transports.protocol import Chunk
-from lidarspec_web.access import write_opening_page
+from lidarspec_web.access import write_redirect_page
 from lidarspec_web.server import PAGE
 
 from .browser import FLAGS, find_browser
@@ -401,7 +401,7 @@ def test_the_file_that_a_browser_is_started_with_leads_to_the_page(
 ) -> None:
     with serve("sim:ldrobot-stl27l?rate=0.5") as link:
         page = browser.new_page()
-        page.goto(write_opening_page(tmp_path, link).as_uri())
+        page.goto(write_redirect_page(tmp_path, link).as_uri())
         page.wait_for_url(link)
         page.wait_for_selector('#status:has-text("streaming")')
         assert page.evaluate("document.referrer") == ""

@@ -76,7 +76,7 @@ def wait_until_files(folder: Path, count: int) -> None:
 
 
 def test_messages_above_the_rate_wait() -> None:
-    limit = RateLimit(at_once=3, per_second=10.0)
+    limit = RateLimit(burst=3, per_second=10.0)
     assert [limit.delay_s(100.0) for _ in range(5)] == pytest.approx([0, 0, 0, 0.1, 0.2])
     assert limit.delay_s(100.2) == pytest.approx(0.1)
     assert [limit.delay_s(200.0) for _ in range(4)] == pytest.approx([0, 0, 0, 0.1])

@@ -25,7 +25,7 @@ def scan_of(sensor: str) -> Scan:
 
 
 def sent(scan: Scan, most: int = ALL) -> bytes:
-    return make_scan_message(scan, 12, position=1.5, sent=1.7e9, max_points=most)
+    return make_scan_message(scan, 12, position=1.5, arrival=1.7e9, max_points=most)
 
 
 @pytest.mark.parametrize("sensor", [FLAT, SOLID])

@@ -128,9 +128,9 @@ def test_connecting_and_leaving_pages_are_announced(tmp_path: Path) -> None:
         with station.page() as page:
             page.until("hello")
             assert station.said == [
-                "page 1 opened by 127.0.0.1; open pages: 1",
-                "page 1 closed; open pages: 0",
-                "page 2 opened by 127.0.0.1; open pages: 1",
+                "page 1 was opened by 127.0.0.1; open pages: 1",
+                "page 1 was closed; open pages: 0",
+                "page 2 was opened by 127.0.0.1; open pages: 1",
             ]
 
 
