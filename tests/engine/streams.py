@@ -101,7 +101,7 @@ def hostile_streams(subject: SensorUnderTest, length: int) -> Iterator[tuple[str
         )  # type: ignore[misc]
         yield f"headers of one length of {name}", lead + one_length
         yield (
-            f"cut frames of {name}",
+            f"truncated frames of the type {name}",
             lead + _repeat(lambda frames=frames: _cut(source.choice(frames), source), length),
         )  # type: ignore[misc]
     yield (
@@ -109,7 +109,10 @@ def hostile_streams(subject: SensorUnderTest, length: int) -> Iterator[tuple[str
         _repeat(lambda: b"".join(_header(sensor, name, source) for name in names), length),
     )
     examples = [subject.example(name, seed=seed) for name in names for seed in range(4)]
-    yield "cut frames of all types", _repeat(lambda: _cut(source.choice(examples), source), length)
+    yield (
+        "truncated frames of all types",
+        _repeat(lambda: _cut(source.choice(examples), source), length),
+    )
     yield "types in turn", (subject.stream(rounds=2) * length)[:length]
 
 

@@ -89,7 +89,8 @@ def splits(share: float) -> Figure:
             tried += 1
             differing += books.finish() != whole or books.decoder.stats != stats
     return Figure(
-        f"{tried:,} splits of streams of {len(streams())} sensors and shapes: {differing} differ",
+        f"{tried:,} splits of streams of {len(streams())} real and invented sensors: {differing}"
+        " results differ",
         not differing,
     )
 
@@ -196,7 +197,7 @@ def delay(share: float) -> Figure:
             for found in decoder.feed(data[spot : spot + 1]):
                 worst_share = max(worst_share, (spot + 1 - found.offset - len(found.data)) / bound)
     return Figure(
-        f"at most {worst_share:.2f} times the length of the longest frame, in bytes",
+        f"at most {worst_share:.2f} times as many bytes as the longest frame has",
         worst_share < 1,
     )
 
@@ -279,7 +280,7 @@ def measure_blocked_rotors(share: float) -> Figure:
             f" {sum(scan.complete for scan in scans)} complete"
         )
         kept &= len(scans) > 1 and packets < 500 and not any(scan.complete for scan in scans)
-    return Figure("rotor blocked, " + "; ".join(told), kept)
+    return Figure("blocked rotor, " + "; ".join(told), kept)
 
 
 #: Bytes of a stream that are decoded together, about as many as a serial port holds.
@@ -428,8 +429,8 @@ def nothing_runs(share: float) -> Figure:
             )
         ran = Path(place, "ran").exists()
     words = (
-        f"5 files from others: {'Python ran' if ran else 'no Python ran'}, {opened}"
-        " files read a descriptor or caused a crash"
+        f"5 untrusted files: {'Python code ran' if ran else 'no Python code ran'}; {opened} files"
+        " made lidarspec read a file descriptor or crash"
     )
     return Figure(words, not ran and not opened)
 
@@ -506,8 +507,8 @@ def not_in_silence(share: float) -> Figure:
                 else [f"{name} (exit code {done.returncode})"]
             )
     return Figure(
-        f"{len(cases)} files, truncated, damaged, and with nominal angles:"
-        f" {', '.join(silent) or 'each reported'}",
+        "a truncated file, a damaged file, and a file without calibration:"
+        f" {', '.join(silent) or 'each is reported'}",
         not silent,
     )
 

@@ -41,7 +41,13 @@ SCANS = "tests/scans/test_scans.py"
 
 EVERY = (
     Promise("P1", "any split of a stream gives the same result", (RULE,), "", figures.splits),
-    Promise("P2", "every recoverable frame is recovered", (RULE,), "", figures.measure_recovery),
+    Promise(
+        "P2",
+        "every frame that a damaged stream still contains is found",
+        (RULE,),
+        "",
+        figures.measure_recovery,
+    ),
     Promise(
         "P3",
         "only documented exceptions",
@@ -65,7 +71,7 @@ EVERY = (
     ),
     Promise(
         "P6",
-        "the delay until a frame is returned is shorter than the longest frame",
+        "a frame is returned before as many further bytes have arrived as the longest frame has",
         (LIMITS,),
         "",
         figures.delay,
@@ -131,7 +137,8 @@ EVERY = (
         "P16",
         "clocks are unwrapped",
         (f"{PROMISES}::TestClocks", "tests/packets/test_clocks.py"),
-        "clocks that wrap at 30 s, an hour or 16 bits, 100 wraps each, with late packets: exact",
+        "clocks that wrap at 30 s, an hour or 16 bits, 100 wraps each, with late packets: all times"
+        " are exact",
     ),
     Promise(
         "P17",
@@ -146,11 +153,17 @@ EVERY = (
         ("tests/framing/test_framing.py",),
         "decoders that run in turns or in 8 threads give the same results as one alone",
     ),
-    Promise("P19", "a scan always ends", (SCANS,), "", figures.measure_blocked_rotors),
+    Promise(
+        "P19",
+        "a scan always ends; if the rotor is blocked, the scan is incomplete",
+        (SCANS,),
+        "",
+        figures.measure_blocked_rotors,
+    ),
     Promise(
         "P20",
-        "decoding is 10 times as fast as the line, and needs less than 64 bytes of memory for each"
-        " byte of input",
+        "decoding is 10 times as fast as the line, even if the stream is hostile, and needs less"
+        " than 64 bytes of memory for each byte of input",
         (RULE,),
         "",
         figures.slowest,
@@ -164,7 +177,7 @@ EVERY = (
     ),
     Promise(
         "P22",
-        "files from others run no code",
+        "untrusted files run no code",
         (
             "tests/device/test_named_devices.py",
             RECORDINGS,
@@ -183,7 +196,7 @@ EVERY = (
     ),
     Promise(
         "P24",
-        "every loss is reported",
+        "lost data and missing calibrations are reported",
         ("tests/cli/test_captures.py", "tests/cli/test_terminal.py"),
         "",
         figures.not_in_silence,
