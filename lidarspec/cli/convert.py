@@ -133,7 +133,9 @@ class _Counts:
     " this kind.",
 )
 @click.option(
-    "--force", is_flag=True, help="Overwrite OUT; with --to, also convert finished files again."
+    "--force",
+    is_flag=True,
+    help="Overwrite OUT; with --to, repeat conversions that are already finished.",
 )
 @click.option(
     "--to",

@@ -134,7 +134,7 @@ def _iter_tables(sensor: Sensor, frames: Iterable[InputPiece], output: str | Non
 @click.option(
     "--diff",
     metavar="HEX|FILE|next",
-    help="Compare with this frame bit by bit; 'next' is the second frame of the input.",
+    help="Compare the first frame with this frame bit by bit; 'next': the next frame of its type.",
 )
 @output_options
 def explain(

@@ -309,7 +309,8 @@ SELECTING: dict[str, Callable[[Any], Any]] = {
     "time": click.option(
         "--time",
         type=click.Choice(["sensor", "utc", "host"]),
-        help="Clock for the stamps and for --slice.  [default: sensor]",
+        help="Clock for the stamps and for --slice; utc: the sensor's clock converted to UTC, host:"
+        " arrival times.  [default: sensor]",
     ),
     "beams": click.option(
         "--beams",

@@ -58,7 +58,7 @@ from lidarspec.view.svg import svg
     metavar="NUMBER",
     default=1,
     show_default=True,
-    help="Number of the complete scan to plot.",
+    help="Which complete scan to plot, counted from 1.",
 )
 @click.option(
     "-t",
