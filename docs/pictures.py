@@ -74,7 +74,7 @@ def cloud() -> str:
         fit_to_points(scan.points, choose_appearance(scan.points)),
         f"{sensor.id}: {len(scan):,} points",
         side=520,
-        most=9000,
+        max_dots=9000,
     )
 
 

@@ -152,7 +152,7 @@ def _make_picture(points: PointCloud, title: str) -> str:
         fit_to_points(points, choose_appearance(points)),
         title,
         side=PICTURE_PX,
-        most=MAX_DOTS,
+        max_dots=MAX_DOTS,
     )
 
 

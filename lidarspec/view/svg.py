@@ -49,7 +49,7 @@ def svg(
     title: str,
     *,
     side: int = SIDE_PX,
-    most: int | None = None,
+    max_dots: int | None = None,
 ) -> str:
     """Return a cloud as an SVG document.
 
@@ -58,10 +58,10 @@ def svg(
     Args:
         look: the extent of the view and the colours of the points, from `choose_appearance`.
         side: width and height of the view from above, in pixels.
-        most: maximum number of dots in a view; None for no limit.
+        max_dots: maximum number of dots in a view; None for no limit.
     """
     cloud = points[points.valid]
-    views = _ViewDrawer(cloud, look, side, most, ramp_indices(cloud, look))
+    views = _ViewDrawer(cloud, look, side, max_dots, ramp_indices(cloud, look))
     if look.flat:
         shown = [views.draw_from_above()]
     else:
@@ -117,14 +117,14 @@ class _ViewDrawer:
 
     Attributes:
         side: side of the view from above, in pixels.
-        most: maximum number of dots in a view; None for no limit.
+        max_dots: maximum number of dots in a view; None for no limit.
         colours: the colour of each point, as a step of the colour ramp, (n,).
     """
 
     cloud: PointCloud
     look: CloudAppearance
     side: int
-    most: int | None
+    max_dots: int | None
     colours: NDArray[np.intp]
 
     @property
@@ -234,7 +234,7 @@ class _ViewDrawer:
                 np.int64
             )
             _, first = np.unique(cells @ (1 << 20, 1), return_index=True)
-            if self.most is None or len(first) <= self.most:
+            if self.max_dots is None or len(first) <= self.max_dots:
                 break
         cells = cells[first]
         colours = self.colours[inside[first]]

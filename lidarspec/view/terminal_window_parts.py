@@ -48,7 +48,8 @@ def write_title(window: CellGrid, sensor: str, source: str, state: str, ink: int
 def shorten_source(source: str, room: int) -> str:
     """Return the source, shortened to fit.
 
-    A source that is too long is replaced by "..." and its end, or by "" if there is hardly space.
+    A source that is too long is replaced by "..." and its end; if `room` is at most
+    `MIN_SOURCE_COLUMNS`, it is replaced by "".
 
     Args:
         room: number of characters that are available.
@@ -61,27 +62,27 @@ def shorten_source(source: str, room: int) -> str:
 
 
 def write_side(
-    window: CellGrid, left: int, figures: Sequence[WindowFigure], look: CloudAppearance
+    window: CellGrid, first_column: int, figures: Sequence[WindowFigure], look: CloudAppearance
 ) -> None:
     """Write statistics, colours and keys at the right of the picture.
 
     Args:
-        left: index of the leftmost column of this side panel, directly right of the picture.
+        first_column: index of the first column to write, directly to the right of the picture.
         figures: the statistics, one per line.
     """
     columns, lines = window.size
     for row in range(1, lines):
-        window.write(row, left, "│", FAINT)
+        window.write(row, first_column, "│", FAINT)
     for row, figure in enumerate(figures[: lines - 1], start=1):
-        window.write(row, left + 2, figure.name, LABEL)
+        window.write(row, first_column + 2, figure.name, LABEL)
         window.write(row, columns - 1 - len(figure.value), figure.value, figure.ink)
     ramp_row = len(figures) + 2
     hints_row = lines - len(HINTS)
     if ramp_row + 2 <= hints_row:
-        _write_ramp(window, ramp_row, left + 2, look)
+        _write_ramp(window, ramp_row, first_column + 2, look)
     if ramp_row + 2 < hints_row:
         for row, (first, second) in enumerate(HINTS, start=hints_row):
-            window.write(row, left + 2, f"{first:<{HINT_COLUMNS}}{second}", FAINT)
+            window.write(row, first_column + 2, f"{first:<{HINT_COLUMNS}}{second}", FAINT)
 
 
 def write_last_line(window: CellGrid, figures: Sequence[WindowFigure]) -> None:

@@ -109,7 +109,7 @@ def points(f: Fields, packets: int) -> Polar:
 def starts_on_grid(f: Fields, packets: int) -> Any:
     """Return whether the start angle is a multiple of the angle that one packet covers.
 
-    0 is excluded, because packets of every model start at 0.
+    0 is excluded: it is a multiple for every model, and so distinguishes none.
 
     Args:
         packets: packets per revolution of the model.

@@ -411,9 +411,10 @@ def make_start_packets(
 
 
 def has_customer_firmware(f: Fields) -> Any:
-    """Return whether `mt.m` of a packet can be the customer firmware: not 0, and no start packet.
+    """Return whether `mt.m` of a packet can be the customer firmware.
 
-    In a start packet, `mt.m` is the scan rate. Source: manual 2.2.3, M&T.
+    It cannot if it is 0, or if the packet is a start packet: `mt.m` is then the scan rate. Source:
+    manual 2.2.3, M&T.
     """
     return (f.mt.start == 0) & (f.mt.m > 0)
 

@@ -7,9 +7,9 @@ A packet has 861 bytes, 893 with a signature:
     [safety], tail [, sequence] [, IMU], CRC [, signature]
 
 The models differ in the status. The CRCs probably cover the same bytes as in packets of a QT128. No
-captured packet was available to confirm this, so the CRCs are read but not checked. The operational state and the azimuth
-state of the block determine which channels fire and when. Below 2.85 m, 32 channels of a
-Pandar128E3X fire 0.8 to 16.7 us later than in the tables of this module.
+captured packet was available to confirm this, so the CRCs are read but not checked. The operational
+state and the azimuth state of the block determine which channels fire and when. Below 2.85 m, 32
+channels of a Pandar128E3X fire 0.8 to 16.7 us later than in the tables of this module.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc: status of each model, block and
 firing times; angle and firing-time files of sample units); Pandar128E3X user manual (lengths; the
