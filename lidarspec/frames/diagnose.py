@@ -167,7 +167,7 @@ def _describe_misfit(part: ExaminedFrame) -> Fault:
     if shortage is not None:
         return shortage
     end = part.start + len(part.data)
-    expected = "parts that end where the sequence of parts ends"
+    expected = "parts whose sizes add up to the size of the sequence"
     return Fault(LENGTH, part.prefix, part.start, expected, None, end)
 
 

@@ -424,7 +424,7 @@ class _Encoder:
                 row[0, offset : offset + leaf.size] = np.frombuffer(value.raw, np.uint8)
 
     def _is_absent(self, seal: Seal, row: NDArray[np.uint8]) -> bool:
-        """Return whether the caller gives a checksum that means "none" (`Seal.absent`)."""
+        """Return whether the caller's checksum stands for "no checksum" (`Seal.absent`)."""
         if not seal.absent or any(
             get_member(self._given, leaf.info.path, None) is None for leaf in seal.leaves
         ):
@@ -451,7 +451,10 @@ class _Encoder:
         for condition in layout.conditions:
             if not layout.meet_condition(condition, row)[0]:
                 named = ", ".join(info.path for info in condition.fields)
-                raise UsageError(f"{self._place}: the condition on {named} is false")
+                raise UsageError(
+                    f"{self._place}: the values of {named} do not meet a condition of the struct:"
+                    " `lidarspec show` lists the conditions"
+                )
 
     def _make_shown_path(self, path: str) -> str:
         return f"{self._prefix}.{path}".strip(".")

@@ -829,51 +829,55 @@ class HeaderTree:
         Returns:
             Pairs of a layout or refusal and the indices of its candidates.
         """
-        places = _CandidateSet(buffer, offsets, stops, self.limit)
+        candidates = _CandidateSet(buffer, offsets, stops, self.limit)
         groups: list[Group] = []
-        for result, which in self.group_by_layout(len(offsets), places.read, places):
+        for result, which in self.group_by_layout(len(offsets), candidates.read, candidates):
             groups.append((result, which))
             if isinstance(result, LayoutRefusal) and result.constants:
-                wrong = places.have_wrong_constants(result.constants, which)
+                wrong = candidates.have_wrong_constants(result.constants, which)
                 groups[-1] = result, which[~wrong]
-                places.refuted.append(which[wrong])
+                candidates.refuted.append(which[wrong])
         return groups + [
             (LayoutRefusal(has_wrong_constant=True), which)
-            for which in places.refuted
+            for which in candidates.refuted
             if len(which)
         ]
 
     def group_by_layout(
-        self, number: int, read: Reader, places: _CandidateSet | None = None
+        self, number: int, read: Reader, candidates: _CandidateSet | None = None
     ) -> list[Group]:
         """Group candidates by layout, given a function that reads their fields.
 
         Args:
             number: the number of candidates.
             read: the function, which reads the field of a node in some candidates.
-            places: the candidates in a buffer; None if there is no buffer.
+            candidates: the candidates in a buffer; None if there is no buffer.
         """
         self._limit_cache()
         groups: list[Group] = []
         stack = [(self._root, np.arange(number))] if number else []
         while stack:
             node, which = stack.pop()
-            if len(which) == 1 and places is not None:
+            if len(which) == 1 and candidates is not None:
                 node = self._find_end(
-                    places.get_longest_bytes(which), node, is_whole_frame=places.stops is not None
+                    candidates.get_longest_bytes(which),
+                    node,
+                    is_whole_frame=candidates.stops is not None,
                 )
             elif node.leaf is None and node.result is None:
                 data: bytes | memoryview = (
-                    b"" if places is None else places.get_longest_bytes(which)
+                    b"" if candidates is None else candidates.get_longest_bytes(which)
                 )
                 self._explore(
-                    node, data, is_whole_frame=places is not None and places.stops is not None
+                    node,
+                    data,
+                    is_whole_frame=candidates is not None and candidates.stops is not None,
                 )
             if node.result is not None:
                 groups.append((node.result, which))
                 continue
-            if places is not None and (len(which) == 1 or node.leaf is None):
-                places.add_refuted(node, which)
+            if candidates is not None and (len(which) == 1 or node.leaf is None):
+                candidates.add_refuted(node, which)
                 continue
             there, values = read(node, which)
             which = which if there is None else which[there]

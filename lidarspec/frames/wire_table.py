@@ -210,7 +210,7 @@ def _iter_rows(
                 "; ".join(filter(None, (condition, f"required: {format_formula(node.condition)}"))),
             )
         case tree.Never():
-            yield WireRow(str(start), "0", "no frame", shown, "", condition)
+            yield WireRow(str(start), "0", "invalid frame", shown, "", condition)
         case tree.Block():
             for part in node.parts:
                 yield _make_row(

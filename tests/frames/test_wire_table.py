@@ -16,7 +16,7 @@ from tests.representatives import each_sensor, each_shape, load_sensor
 from tests.shapes import SHAPES
 
 #: Types of rows that stand for no field.
-NO_FIELDS = ("array", "parts", "check", "no frame")
+NO_FIELDS = ("array", "parts", "check", "invalid frame")
 
 
 def evaluate_formula(formula: str, names: dict[str, object]) -> int:
