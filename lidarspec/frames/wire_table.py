@@ -163,7 +163,7 @@ def _make_element_path(shown: str) -> tuple[str, str]:
 def _iter_rows(
     node: tree.Node, shown: str, start: SizeFormula, condition: str, seals: Mapping[str, str]
 ) -> Iterator[WireRow]:
-    """Yield the rows of a part that begins at `start` and exists under a condition."""
+    """Yield the rows of a node that begins at `start` and exists under a condition."""
     match node:
         case tree.Struct():
             for member in node.members:
@@ -253,7 +253,7 @@ def _make_part_path(shown: str, part: tree.BlockInteger) -> str:
 
 
 def _describe_bits(part: tree.BlockInteger) -> tuple[str, str]:
-    """Return the size and the type of a part of a bit block, as texts."""
+    """Return the size and the type of a number in a bit block, as texts."""
     if part.info.dtype is None and part.bits.run is not None and part.bits.is_whole:
         order, _, size, _ = part.bits.run
         return (
@@ -278,7 +278,7 @@ def _describe_type(node: tree.Number | tree.Blob | tree.Opaque) -> str:
 
 
 def list_branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
-    """Return the alternatives of a part, each with its condition as text."""
+    """Return the alternatives of a node, each with its condition as text."""
     if isinstance(node, tree.When):
         condition_text = format_formula(node.condition)
         return [(f"if {condition_text}", node.then), (f"if not {condition_text}", node.otherwise)]

@@ -204,7 +204,7 @@ LETTERS = b"abcdefghijklmnopqrstuvwxyz"
 def _make_random_rows(
     engine: Codec, layout: Layout, number: int, source: random.Random
 ) -> NDArray[np.uint8]:
-    """Return random structs with allowed values, (number, size)."""
+    """Return the bytes of random structs with allowed values, (number, size)."""
     rows = (
         np.frombuffer(source.randbytes(number * layout.size), np.uint8)
         .reshape(number, layout.size)
@@ -302,7 +302,7 @@ def valid_mask(
     """Return whether each struct has only allowed and plausible values, (n,).
 
     Args:
-        rows: structs with constants and checksums set, (n, size).
+        rows: the bytes of structs with correct constants and checksums, (n, size).
 
     Raises:
         SpecError: if `plausible` raises.
