@@ -27,8 +27,8 @@ PAGE = "lidarspec.page"
 _FOLDERS = (".dist-info", ".egg-info")
 
 
-class _NonFolderPathError(Exception):
-    """Distributions may be outside folders, so importlib.metadata has to search."""
+class _SearchNeededError(Exception):
+    """Distributions may be outside folders, so `importlib.metadata` has to find them."""
 
 
 class EntryPoint(NamedTuple):
@@ -69,7 +69,7 @@ def entry_points(group: str) -> list[EntryPoint]:
         entries = [
             entry for folder in _iter_distributions() for entry in _iter_declared(folder, group)
         ]
-    except _NonFolderPathError:
+    except _SearchNeededError:
         entries = _read_by_metadata(group)
     return sorted(entries, key=lambda entry: (entry.name, entry.value))
 
@@ -80,7 +80,7 @@ def _iter_distributions() -> Iterator[str]:
         hasattr(finder, "find_distributions") and finder is not PathFinder
         for finder in sys.meta_path
     ):
-        raise _NonFolderPathError
+        raise _SearchNeededError
     seen = set()
     for path in sys.path:
         for name in _list_names(path or os.curdir):
@@ -99,11 +99,11 @@ def normalise_name(distribution: str) -> str:
 
 def _list_names(path: str) -> list[str]:
     if path.lower().rstrip("/\\").endswith(".egg"):
-        raise _NonFolderPathError
+        raise _SearchNeededError
     try:
         return os.listdir(path)
     except NotADirectoryError:
-        raise _NonFolderPathError from None
+        raise _SearchNeededError from None
     except OSError:
         return []
 
