@@ -279,7 +279,7 @@ def _count_packets(contents: FileContents, opened: Transport) -> None:
         flow.bytes += len(chunk.data)
         bytes_left -= len(chunk.data)
         if contents.first_ns is None:
-            contents.first_ns = chunk.at
+            contents.first_ns = chunk.at or None
         contents.last_read_ns = contents.last_ns = chunk.at or contents.last_ns
         if bytes_left <= 0 or index >= MAX_BEGINNING_PACKETS:
             contents.last_ns = _find_last_time(opened, chunks)

@@ -5,7 +5,7 @@ sensor's clock and an index from its counter. Modules in reading order:
 
 * `packets`: the columns of n frames, raw and physical.
 * `clocks`: reads and unwraps the sensor's clock, in integer nanoseconds.
-* `pace`: the declared time from one packet to the next.
+* `pace`: the declared time between consecutive packets.
 * `returns`: finds the returns of the same firings in consecutive packets.
 * `counter_order`: finds lost, duplicate and late packets by their counter.
 * `clock_order`: finds lost, duplicate and late datagrams by their clock, without a counter.

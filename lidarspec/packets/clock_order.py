@@ -284,7 +284,7 @@ def _count_missing(passed: int, pace: float) -> int:
 
     Args:
         passed: the time between the packets, ns.
-        pace: the time from one packet to the next, ns; nan or 0 if unknown.
+        pace: the time between consecutive packets, ns; nan or 0 if unknown.
     """
     if not pace > 0:
         return 0

@@ -55,7 +55,7 @@ class CounterReadings:
         times: the times by the sensor's clock, (n,) ns; None if there is no clock, or if the
             pace of the clock is not declared.
         steps: the time since the previous packet, (n,) ns; None if `times` is None.
-        paces: the time from each packet to the next, (n,) ns; nan if unknown.
+        paces: the time between each packet and the packet before, (n,) ns; nan if unknown.
     """
 
     numbers: NDArray[Any]

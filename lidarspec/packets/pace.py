@@ -1,4 +1,4 @@
-"""Read the declared time from each packet to the next (`Clock.pace`).
+"""Read the declared time between each packet and the packet before (`Clock.pace`).
 
 The pace is not estimated, because a stream with regular losses has regular steps as well.
 """
@@ -22,7 +22,7 @@ MAX_STEP_NS = 3600 * 10**9
 
 
 def read_paces(clock: Clock, batch: Batch) -> Paces:
-    """Return the time from each packet to the next, (n,) ns; nan if not declared."""
+    """Return the time between each packet and the packet before, (n,) ns; nan if not declared."""
     if clock.pace is None:
         return np.broadcast_to(np.nan, (len(batch),))
     (seconds,) = header_function(clock.pace, batch.table.schema, _to_seconds)(batch)

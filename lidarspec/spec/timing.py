@@ -188,9 +188,10 @@ class Clock:
             are added, in seconds. Terms are added as integer nanoseconds. `unix_time` converts the
             fields of a date.
         wraps_at: the seconds after which the clock starts again at 0; None if it does not.
-        pace: a function of `Fields` that returns the seconds from a packet to the next packet, or
-            nan if they are unknown; None if not declared. The pace must be correct in every mode of
-            the sensor, because it is used to find lost packets and to distinguish related models.
+        pace: a function of `Fields` that returns the seconds that normally pass between the packet
+            before and this packet, or nan if they are unknown; None if not declared. The pace must
+            be correct in every mode of the sensor, because it is used to find lost packets and to
+            distinguish related models.
         reference: the source of the date, for a clock that starts again at 0. It is a pair: the
             name of another frame type that has the same clock, and a function of its `Fields` that
             returns the date in seconds since 1970, or nan if it is unknown. The first frame with a

@@ -16,7 +16,7 @@ from lidarspec.recording.recorders import Recorder
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.protocol import Chunk
 from tests.cli.running import ran, run_json
-from tests.made_captures import frame, pcap
+from tests.made_captures import SIMPLE, frame, interface, packet, pcap, section
 
 START, STEP = 1_700_000_000 * 10**9, 1_327_104
 
@@ -113,3 +113,14 @@ def test_a_file_without_times_and_one_without_sensor(tmp_path: Path) -> None:
     assert "no arrival times" in ran("info", raw).stdout
     assert "no installed sensor matches" in ran("info", noise, code=4).stdout
     ran("info", empty, code=4)
+
+
+def test_a_capture_without_times_has_no_date(tmp_path: Path) -> None:
+    path = tmp_path / "simple.pcapng"
+    frames = simulate(ls.sensor("velodyne-vlp16"), 9)
+    packets = [packet(frame(data), kind=SIMPLE) for data in frames]
+    path.write_bytes(b"".join([section(), interface(), *packets]))
+    assert run_json("info", path)["first_ns"] is None
+    text = ran("info", path).stdout
+    assert "9 packets" in text
+    assert "no arrival times" in text
