@@ -10,8 +10,8 @@ reproduce the azimuths in nebula's published point clouds to the last digit. The
 model, the Helios-1610, was compared with these sources.
 
 The manual has errors. The distance in its example, 320 steps of 0.25 cm, is 0.8 m and not 8 m. In
-its examples of angles, the vertical angle 00 05 d6 is 14.94 degrees and not 14.95, and the
-horizontal angle 01 01 96 is -4.06 degrees.
+its examples of angles, the vertical angle 00 05 d6 is 14.94 degrees and not 14.95, and the formula
+for the horizontal angle 01 01 96, which is -4.06 degrees, lacks brackets.
 
 The sources disagree in four places. The second part of a time is in microseconds in Table 9 and in
 nebula's capture; in appendix B.13 it is in nanoseconds. The type is at byte 30 in rs_driver and in

@@ -9,10 +9,10 @@ Source: RS-LiDAR-M1 user guide, 2.1.2 and Table 5 (the data blocks); RS-LiDAR-M1
 Known errors and gaps of the guides: The formula for the time of a group of points is misprinted
 ("titime_offset"); the time is the packet's timestamp plus time_offset. The angles have an offset of
 32768, which the M1P guide does not mention in its table, but on the page after the table. In the
-worked example, z is printed as 2.17, but is 2.1647. The formula raw - 80
-for mems_tmp gives -46 degC for the guide's own capture, so the raw byte is kept unless the option
-`firmware` selects a formula. The 750 000 points per second in the guide do not agree with 630
-packets in a frame, which result in 787 500 points.
+worked example, z is printed as 2.17, but is 2.1647. The formula raw - 80 for mems_tmp gives -46
+degC for the guide's own capture, so the raw byte is kept unless the option `firmware` selects a
+formula. The 750 000 points per second in the guide do not agree with 630 packets in a frame, which
+result in 787 500 points.
 
 From byte 28 on, DIFOP has one of three layouts. `difop` is the layout of rs_driver since December
 2023. `difop_fov` is the layout of earlier editions of the driver. `difop_guide` is the layout of

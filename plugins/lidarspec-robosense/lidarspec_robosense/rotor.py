@@ -304,7 +304,7 @@ def points_of_firings(f: Fields, dual: Any, model: RotorModel, *, first_echo: An
 
 
 def points_of_groups(f: Fields, dual: Any, model: RotorModel, angles: tuple[Any, Any]) -> Polar:
-    """Return the points of blocks with two groups, each of which contains each laser once.
+    """Return the points of blocks with two groups, each with all lasers.
 
     With `dual`, the groups are the two returns of one firing; otherwise they are two firings.
     `angles` has the elevation and the horizontal angle of each laser, as in `make_points`.

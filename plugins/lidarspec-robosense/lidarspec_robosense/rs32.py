@@ -171,7 +171,7 @@ def is_plausible_bpearl(f: Fields, v4: bool) -> Any:
 
 
 def read_time(f: Fields) -> tuple[Any, Any, Any]:
-    """Return the whole seconds since 1970, and the fields with milliseconds and microseconds."""
+    """Return the time: whole seconds since 1970, milliseconds and microseconds."""
     date = unix_time(f.year + 2000, f.month, f.day, f.hour, f.minute, f.second)
     return date, f.milliseconds, f.microseconds
 

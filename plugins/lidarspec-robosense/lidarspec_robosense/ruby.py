@@ -12,10 +12,10 @@ the RSP variants: firing times, optical centre, DIFOP).
 
 The sources disagree. Series and model are at bytes 31 and 32 in the manual, and at 30 and 31 in
 rs_driver, so both positions are read. In the manuals, the return mode is in every packet; rs_driver
-reads it from DIFOP, with other codes for each model. This module follows the manuals. Early units send the time in
-seconds and nanoseconds, but this module always reads seconds and microseconds. According to the
-manual, with dual return the first of two blocks contains the last returns, and the second block
-contains the strongest returns.
+reads it from DIFOP, with other codes for each model. This module follows the manuals. Early units
+send the time in seconds and nanoseconds, but this module always reads seconds and microseconds.
+According to the manual, with dual return the first of two blocks contains the last returns, and the
+second block contains the strongest returns.
 
 No table of nominal angles was found. The angles are assumed to be evenly spaced over 40 degrees,
 with the lowest laser first. 40 degrees is the field of view in the data sheets for 128 and 80
@@ -155,7 +155,7 @@ def firing_times(times: Any, counts: Any) -> NDArray[np.float64]:
 
 
 def even_firing_times(*counts: int) -> NDArray[np.float64]:
-    """Return the firing time of each laser in seconds, for models with evenly spaced times.
+    """Return the firing times of lasers in seconds, if the times are evenly spaced.
 
     The lasers form two groups. Both groups fire at the same 16 times, which are 3.236 us apart.
     `counts` has the number of lasers that fire at each time: 16 numbers for the first group, then

@@ -7,11 +7,10 @@ decoder_RSMX.hpp, decoder_RSE1.hpp: packets, packets per frame, limits); E1 user
 For the E1, this module follows the manual, in which packets are counted from 0 and the return modes
 9 to 11 mean dual return; in rs_driver, the mode 0 means dual return. The CRCs at the end of packets
 are not verified, because the bytes that they cover are not public; the CRC of the E1 is called
-AUTOSAR E2E profile 4. It is
-assumed that the M2 and the MX count packets from 1, as the M1 does. It is also assumed that frames
-with dual return have twice as many packets, except for the MX, whose points have two radii. The IMU
-of the E1 is assumed to measure in g and rad/s like the IMU of the Airy, because rs_driver reads
-both in the same way.
+AUTOSAR E2E profile 4. It is assumed that the M2 and the MX count packets from 1, as the M1 does. It
+is also assumed that frames with dual return have twice as many packets, except for the MX, whose
+points have two radii. The IMU of the E1 is assumed to measure in g and rad/s like the IMU of the
+Airy, because rs_driver reads both in the same way.
 """
 
 from __future__ import annotations

@@ -189,8 +189,8 @@ PARAMETERS = (
     Parameter(
         "device_time_is_ros_time",
         False,
-        "Do not convert the time of the sensor's clock, because PTP or GPS sets this clock. Ignored"
-        " if use_device_time is false.",
+        "Stamp messages with the sensor's time, without conversion. PTP or GPS must set the"
+        " sensor's clock. Ignored if use_device_time is false.",
         live=True,
     ),
     Parameter(
@@ -259,7 +259,7 @@ class Settings:
         )
 
     def make_planar_scans(self) -> PlanarScans:
-        """Return a `PlanarScans`, which projects scans to planar scans as the parameters say."""
+        """Return the projection to planar scans that the parameters describe."""
         first = self["angle_min"]
         width = (self["angle_max"] - self["angle_min"]) % (2 * math.pi)
         low = self["scan_z_min"]
@@ -271,7 +271,7 @@ class Settings:
         )
 
     def narrow_range_limits(self, planar: LaserScan) -> LaserScan:
-        """Return the planar scan with its declared range limits narrowed by the parameters."""
+        """Return a planar scan with its range limits narrowed by the parameters."""
         far = min(planar.range_max, self["range_max"] or math.inf)
         return replace(planar, range_min=max(planar.range_min, self["range_min"]), range_max=far)
 

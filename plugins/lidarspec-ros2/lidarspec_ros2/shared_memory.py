@@ -175,7 +175,7 @@ def find_profile_variable() -> str:
 
 
 def find_largest_cloud_bytes(sensor: Sensor) -> int | None:
-    """Return the size of a sensor's largest cloud in bytes, calculated from simulated packets.
+    """Return the size in bytes of the largest cloud of a sensor, from simulated packets.
 
     The result is None if the description of the sensor does not contain the rate of its packets.
 

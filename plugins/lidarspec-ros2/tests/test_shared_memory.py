@@ -207,12 +207,8 @@ def test_clouds_arrive_with_best_effort_at_the_full_rate(
     code, log = end_node(process)
     assert arrived >= MIN_SHARE * sent
     assert code == 0
-    assert (
-        log.count(
-            "Fast DDS was configured to use 21 MB of shared memory, for clouds of up to 2.5 MB"
-        )
-        == 1
-    )
+    notice = "Fast DDS was configured to use 21 MB of shared memory, for clouds of up to 2.5 MB"
+    assert log.count(notice) == 1
 
 
 def test_larger_clouds_than_foreseen_are_a_warning(run: Callable[..., Any], client: Client) -> None:

@@ -148,7 +148,7 @@ def make_messages(cola: str) -> Mapping[str, Frame]:
 def make_request(
     frame: str, reply: str, values: Mapping[str, Any] | None = None, **more: Any
 ) -> Command:
-    """Return the command that sends a request, and repeats it once if no reply arrives.
+    """Return a command that sends a request, and repeats it if no reply arrives.
 
     Args:
         frame: the frame type of the request.

@@ -157,7 +157,7 @@ def make_frames(family: ScannerFamily, cola: str) -> dict[str, Frame]:
 
 
 def configure(sensor: Sensor, *, cola: Literal["A", "B"] = "B", echoes: int = 0) -> Sensor:
-    """Return the scanner with commands in CoLa A or B, and scans with a number of echoes.
+    """Return the scanner for commands in CoLa A or B, and for a number of echoes.
 
     Args:
         cola: the protocol for commands, "A" (text) or "B" (binary). Scans are read in both.

@@ -112,7 +112,7 @@ FRAMES = {
 def configure(
     sensor: Sensor, *, dtheta: Literal["unsigned", "signed"] | None = None, mode: int | None = None
 ) -> Sensor:
-    """Return the sensor with another interpretation of express capsules, or another scan mode.
+    """Return the sensor with another reading of `dtheta`, or with another scan mode.
 
     Args:
         dtheta: interpretation of the compensation in express capsules: "unsigned" as in the SDK, or

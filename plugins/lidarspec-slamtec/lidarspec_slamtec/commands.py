@@ -39,7 +39,7 @@ def make_plain_request(cmd: str, **more: Any) -> Command:
 def make_request(
     frame: str, reply: str | tuple[str, ...], values: Mapping[str, Any] | None = None, **more: Any
 ) -> Command:
-    """Return the command that sends a request, and repeats it once if no reply arrives.
+    """Return a command that sends a request, and repeats it if no reply arrives.
 
     Args:
         frame: the frame type of the request.

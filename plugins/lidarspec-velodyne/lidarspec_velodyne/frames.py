@@ -138,7 +138,7 @@ POSITION = Struct(
 
 
 def plausible(f: Fields) -> Any:
-    """Return whether azimuths are at most 360 degrees and the product is not a VLP-32C.
+    """Return whether azimuths are possible, and the product is not a VLP-32C.
 
     The distances of a VLP-32C have steps of another size.
     """

@@ -104,7 +104,7 @@ class UnitCalibration:
 
     @property
     def delay(self) -> Any:
-        """Seconds from the first firing with an azimuth to the firing of each slot, (slots,)."""
+        """Seconds from the first firing of an azimuth to each slot's firing, (slots,)."""
         slot = np.arange(SLOTS)
         return (slot // 4 * self.group_period + np.take(self.delays_in_group, slot % 4)) * 1e-6
 

@@ -157,7 +157,7 @@ def add_token(page: str, token: str) -> str:
 
 
 def write_redirect_page(folder: Path, link: str) -> Path:
-    """Write a page that redirects a browser to the link, and return the path of the page."""
+    """Write a page that redirects a browser to `link`, and return the page's path."""
     # Only the user can read the page. Other users can see the command lines of all programs, so a
     # browser is not started with the link.
     path = folder / "open.html"

@@ -143,7 +143,7 @@ class PageMessages:
     def find_point_frame(
         self, shown: ShownScan | None, number: int, index: int, backlog: RecentBytes
     ) -> dict[str, Any]:
-        """Return the explained frame that contained a point, and the path of the point's row.
+        """Return the explained frame of a point, and the path of the point's row.
 
         Args:
             shown: the scan of the point; None if the scan is no longer stored.

@@ -103,7 +103,7 @@ class _DecoderInput:
 
 @dataclass(frozen=True)
 class _FoundFrames:
-    """The frames that the decoder found in one call, and the number of the first frame."""
+    """The frames that the decoder found in one call, with the first frame's number."""
 
     first_number: int
     frames: Frames

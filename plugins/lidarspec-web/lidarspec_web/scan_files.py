@@ -53,7 +53,7 @@ class ScanSaver:
         self._rests_until = 0.0
 
     def make_response(self, shown: ShownScan, suffix: str) -> Response:
-        """Return an HTTP response that writes the scan to a file and sends it when it is served."""
+        """Return an HTTP response that writes and sends the scan when it is served."""
         return _SavedScan(self, shown, suffix)
 
     async def serve(

@@ -40,7 +40,7 @@ class SampleFormat:
 
 
 def camera_angle(distance: Any) -> Any:
-    """Return the angle in degrees between the laser beam and the ray to the image sensor.
+    """Return the angle between laser beam and ray to the image sensor, in degrees.
 
     Models that triangulate have an image sensor beside the laser. Source: YDLidar-SDK Communication
     Protocol, angle second-level analysis.
