@@ -599,7 +599,7 @@ class LayoutRefusal:
     """The reason why frames with a certain header have no layout.
 
     There are three reasons: a plugin expression fails, a constant is wrong, or else the lengths in
-    the header are invalid.
+    the header are invalid (`InvalidLengthError`).
 
     Attributes:
         error: the error of the plugin expression; None for the other reasons.

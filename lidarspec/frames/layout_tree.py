@@ -46,11 +46,12 @@ class UnknownSelectorError(Exception):
 class InvalidLengthError(Exception):
     """The lengths in the header are invalid.
 
-    The frame would be longer than the maximum of the frame type, or have no bytes.
+    The frame would be longer than the maximum of the frame type, or have no bytes. This error is
+    also raised if the header selects a case that no valid frame has (construct's `Error`).
 
     Attributes:
-        path: the path of the field, struct or array that makes the frame too long; "" if the frame
-            would have no bytes.
+        path: the path of the field, struct or array that makes the frame too long, or that is not
+            valid; "" if the frame would have no bytes.
         number: the invalid count or length; None if only the sum of the lengths is invalid.
     """
 
@@ -80,7 +81,8 @@ def find_layout(
 
     Raises:
         UnknownSelectorError: if the layout depends on a selector that is not in `values`.
-        InvalidLengthError: if the frame would be longer than `limit`, or have no bytes.
+        InvalidLengthError: if the frame would be longer than `limit`, or have no bytes, or if the
+            header selects a case that no valid frame has.
         UnknownPartError: if the constants of a part match no kind of parts.
         NotCompilableError: if only construct can parse the struct.
         Exception: any error of a formula with these values.

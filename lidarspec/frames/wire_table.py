@@ -25,10 +25,10 @@ class WireRow:
     Attributes:
         offset: the offset of the first byte in the frame, as a number or a formula of header fields
             and indices.
-        size: the size in bytes, as a number or a formula of header fields; "7 bits" for a part of a
-            bit block.
-        type: the type, such as "uint16 le" or "bytes"; for a part of a bit block its bits, the most
-            significant first.
+        size: the size in bytes, as a number or a formula of header fields; "7 bits" for a number
+            in a bit block.
+        type: the type, such as "uint16 le" or "bytes"; for a number in a bit block its bits, the
+            most significant first.
         field: the path, with names of indices for array elements, such as "points[i].distance".
         unit: the scale and unit, such as "0.01 deg".
         meaning: the documentation, constant, labels, checksum and condition of the field.
