@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from lidarspec.frames.layout import Condition, Layout, set_bits
 from lidarspec.frames.layout_tree import (
     HeaderWalk,
+    InvalidCaseError,
     InvalidLengthError,
     UnknownPartError,
     UnknownSelectorError,
@@ -30,6 +31,7 @@ LENGTH = "length"
 COUNT = "count"
 CHECKSUM = "checksum"
 CONDITION = "condition"
+CASE = "case"
 CUT_OFF = "cut off"
 TRAILING = "trailing bytes"
 
@@ -71,6 +73,8 @@ class Fault:
             return f"the frame ends at byte {self.expected}, but {more} more bytes follow"
         if self.kind == CONDITION:
             return f"{self.path}: the condition is false"
+        if self.kind == CASE:
+            return f"{self.path}: the fields before it select an invalid case (construct's Error)"
         if self.kind == LENGTH and self.got is None:
             return f"{self.path}: expected {self.expected}"
         if self.kind == COUNT:
@@ -284,6 +288,8 @@ def _describe_refusal(
     path = f"{examined.prefix}.{failure}".strip(".") or "frame"
     if isinstance(failure, UnknownPartError):
         return Fault(LENGTH, path, end, "only parts of declared kinds", None, end)
+    if isinstance(failure, InvalidCaseError):
+        return Fault(CASE, path, end, "a valid case", None, end)
     length = next((each for each in examined.fields() if each.path == path), None)
     if length is not None and length.info.is_enforced:
         return Fault(LENGTH, path, length.first_byte, failure.number, length.raw, end)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import MissingField, OutOfRange, UsageError
 from lidarspec.frames.field_paths import split_path
 from lidarspec.frames.layout import Layout, Leaf, Seal
-from lidarspec.frames.layout_tree import InvalidLengthError, find_kinds
+from lidarspec.frames.layout_tree import InvalidCaseError, InvalidLengthError, find_kinds
 from lidarspec.frames.measured_size import FOUND, MeasuredSize
 from lidarspec.frames.parts import LayoutLookup
 from lidarspec.frames.schema import Schema, find_count_field, make_schema
@@ -149,6 +149,10 @@ class _Encoder:
         """Return the layout that the values of the header fields select."""
         try:
             return self._layouts.layout_for(self._read_header)
+        except InvalidCaseError as fault:
+            raise UsageError(
+                f"{self._place}: {fault}: these values select an invalid case (construct's Error)"
+            ) from None
         except InvalidLengthError as fault:
             raise UsageError(
                 f"{self._place}: {self._prefix or fault or 'the frame'}: the frame would be"

@@ -46,8 +46,7 @@ class UnknownSelectorError(Exception):
 class InvalidLengthError(Exception):
     """The lengths in the header are invalid.
 
-    The frame would be longer than the maximum of the frame type, or have no bytes. This error is
-    also raised if the header selects a case that no valid frame has (construct's `Error`).
+    The frame would be longer than the maximum of the frame type, or have no bytes.
 
     Attributes:
         path: the path of the field, struct or array that makes the frame too long, or that is not
@@ -59,6 +58,10 @@ class InvalidLengthError(Exception):
         self.path = path
         self.number = number
         super().__init__(path)
+
+
+class InvalidCaseError(InvalidLengthError):
+    """The header selects a case that no valid frame has (construct's `Error`)."""
 
 
 class UnknownPartError(Exception):
@@ -237,7 +240,7 @@ class HeaderWalk:
             case tree.Check() if 0 not in shape:
                 self.conditions[node] = Condition.of(node)
             case tree.Never():
-                raise InvalidLengthError(path)
+                raise InvalidCaseError(path)
             case tree.Derived():
                 self._add_derived(node, path, shape, strides)
             case tree.Opaque():

@@ -85,6 +85,14 @@ def test_frames_are_judged_as_construct_judges_them(name: str) -> None:
     assert all(ours.parse(ours.example("data", seed=seed)) for seed in range(5))
 
 
+def test_a_case_that_is_an_error_is_named() -> None:
+    ours = sensor(CONDITIONS["errors"])
+    with pytest.raises(WireError, match=r"v: the fields before it select an invalid case"):
+        ours.parse(b"\7\1\2")
+    with pytest.raises(UsageError, match=r"v: these values select an invalid case"):
+        ours.build("data", a=7, v={"d": 1})
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_forbidden_values_are_counted_shown_and_not_built(backend: str) -> None:
     ours = sensor(Struct("a" / OneOf(Int8ub, [1, 2]), "b" / Int8ub, "ok" / Check(this.b < 9)))
