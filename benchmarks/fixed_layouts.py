@@ -112,9 +112,13 @@ def compact_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
         "beams" / Array(beams, Array(layers, beam)),
         "crc" / Int32ul,
     )
-    sealed = Checksummed(struct, field="crc", algorithm=compact.CRC)
+    checksummed = Checksummed(struct, field="crc", algorithm=compact.CRC)
     return make_sensor(
-        sealed, partial(compact.points, version=4), len(frame), scan="turn", clock="start_time[0]"
+        checksummed,
+        partial(compact.points, version=4),
+        len(frame),
+        scan="turn",
+        clock="start_time[0]",
     )
 
 
@@ -155,7 +159,7 @@ def cola_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
         *content,
         "checksum" / Int8ub,
     )
-    sealed = Checksummed(
+    checksummed = Checksummed(
         struct, field="checksum", algorithm=Xor(), over=tuple(part.name for part in content)
     )
 
@@ -172,7 +176,7 @@ def cola_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
         )
 
     return make_sensor(
-        sealed, points, len(frame), scan="telegram_counter", clock="time", stream=True
+        checksummed, points, len(frame), scan="telegram_counter", clock="time", stream=True
     )
 
 
@@ -195,11 +199,11 @@ def livox_packet(sensor: ls.Sensor, frame: bytes) -> Sensor:
         "timestamp" / Scaled(Int64ul, 1, "ns"),
         points,
     )
-    sealed = Checksummed(
+    checksummed = Checksummed(
         struct, field="crc32", algorithm=sdk2.CRC32, over=("timestamp", "points"), absent=(0,)
     )
     return make_sensor(
-        sealed,
+        checksummed,
         lambda f: livox.cartesian(f, sdk2.point_times(f)),
         len(frame),
         scan="frame_cnt",

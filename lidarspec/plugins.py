@@ -60,7 +60,7 @@ from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.results import Points
-from lidarspec.spec.syntax import iter_seals, prepare
+from lidarspec.spec.syntax import iter_checksummed, prepare
 from lidarspec.trusted_files import read_document, user_settings_path
 
 if TYPE_CHECKING:
@@ -757,10 +757,10 @@ def _replace_checksum(frame: Frame, algorithm: Any) -> Frame:
     if not isinstance(algorithm, Checksum):
         raise SpecError(f"the hook must return a Checksum or None, got {type(algorithm).__name__}")
     struct = prepare(frame.struct)
-    seal = next(iter_seals(struct), None)
-    if seal is None:
+    checksum = next(iter_checksummed(struct), None)
+    if checksum is None:
         raise SpecError("the hook returns a checksum for a frame type that declares no checksum")
-    seal.algorithm = algorithm
+    checksum.algorithm = algorithm
     return replace(frame, struct=struct)
 
 

@@ -28,7 +28,7 @@ class ConstructFrame(Frame):
 
 def _with_part(node: tree.Node) -> tree.Node:
     """Return the tree of a frame with `_NEVER_COMPILED` added at its end."""
-    if isinstance(node, tree.Sealed):
+    if isinstance(node, tree.ChecksummedStruct):
         return dataclasses.replace(node, body=_with_part(node.body))
     assert isinstance(node, tree.Struct)
     return dataclasses.replace(node, members=(*node.members, _NEVER_COMPILED))

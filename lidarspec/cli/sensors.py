@@ -229,7 +229,7 @@ def _list_plan(sensor: Sensor, frame: str) -> list[str]:
     except SpecError as error:
         return [f"reference evaluator: {error}"]
     if sweep:
-        frames = maker.seal(maker.table([sweep(index) for index in range(PLANNED_PACKETS)]))
+        frames = maker.make_frames(maker.table([sweep(index) for index in range(PLANNED_PACKETS)]))
     else:
         frames = [sensor.example(frame)]
     sent = pack_found([Found(frame, 0, data) for data in frames])

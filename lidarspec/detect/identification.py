@@ -39,7 +39,7 @@ from lidarspec.errors import (
     suggest,
 )
 from lidarspec.expressions.columns import Batch, Fields
-from lidarspec.frames.layout import Bytes2D, Seal, Sums
+from lidarspec.frames.layout import Bytes2D, FrameChecksum, Sums
 from lidarspec.frames.parse import identify
 from lidarspec.frames.schema import make_schema
 from lidarspec.framing.decoder import Decoder
@@ -488,14 +488,14 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
     )
 
 
-def _read_stored_checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64]:
+def _read_stored_checksums(checksum: FrameChecksum, rows: Bytes2D) -> NDArray[np.uint64]:
     """Return the checksums that frames contain, (n,), so that all checksums are accepted.
 
     Args:
-        seal: the checksum as the struct of the frame declares it.
+        checksum: the checksum as the struct of the frame declares it.
         rows: the bytes of the frames, one row per frame.
     """
-    return seal.load_stored(rows)
+    return checksum.load_stored(rows)
 
 
 def _score_each(

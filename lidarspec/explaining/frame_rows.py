@@ -15,7 +15,7 @@ from lidarspec.frames.number_format import find_number_format
 from lidarspec.frames.plain import list_plain_fields
 from lidarspec.frames.schema import make_schema, without_indices
 from lidarspec.frames.wire_coder import frame_coder
-from lidarspec.frames.wire_fields import PlacedSeal, WireField, examine
+from lidarspec.frames.wire_fields import ExaminedChecksum, WireField, examine
 from lidarspec.frames.wire_table import format_bits, format_hex
 from lidarspec.spec import Frame
 from lidarspec.spec.tree import UNNAMED, FieldInfo, format_values
@@ -66,7 +66,9 @@ class FrameRows:
             return list_plain_fields(frame, struct)
         examined = examine(frame.tree, struct, frame.max_struct_bytes)
         with contextlib.suppress(Exception):  # a plugin's checksum; `fault` has the exception
-            self._verdicts = {seal.path: _describe_checksum(seal) for seal in examined.seals()}
+            self._verdicts = {
+                checksum.path: _describe_checksum(checksum) for checksum in examined.checksums()
+            }
         fields = list(examined.fields())
         if examined.layout is None and all(field.raw is not None for field in fields):
             cut_off = WireField("", "", FieldInfo(""), len(struct), len(struct), None, None)
@@ -180,10 +182,10 @@ def _make_value(field: WireField, info: FieldInfo) -> FieldValue:
     )
 
 
-def _describe_checksum(checksum: PlacedSeal) -> tuple[str, bool]:
+def _describe_checksum(checksum: ExaminedChecksum) -> tuple[str, bool]:
     """Return a text about a stored checksum, and whether the checksum is valid."""
-    algorithm = checksum.seal.algorithm
-    count = sum(end - start for start, end in checksum.seal.spans)
+    algorithm = checksum.checksum.algorithm
+    count = sum(end - start for start, end in checksum.checksum.spans)
     plural = "s" if count != 1 else ""
     stored = format_hex(checksum.stored, algorithm.width)
     computed = format_hex(checksum.computed, algorithm.width)

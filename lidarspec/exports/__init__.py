@@ -104,10 +104,10 @@ class ExportedFrame:
 
     name: str
     frame: Frame
-    root: tree.Struct | tree.Sealed
+    root: tree.Struct | tree.ChecksummedStruct
 
     @property
-    def seals(self) -> dict[str, tree.Sealed]:
+    def checksums(self) -> dict[str, tree.ChecksummedStruct]:
         """The nodes with checksums, by the path of each field that stores a checksum.
 
         If a checksum is stored in several fields, all their paths are keys.
@@ -115,7 +115,7 @@ class ExportedFrame:
         return {
             path: node
             for node in tree.nodes(self.root)
-            if isinstance(node, tree.Sealed)
+            if isinstance(node, tree.ChecksummedStruct)
             for path in node.fields
         }
 
@@ -194,7 +194,7 @@ def _make_exported_frame(sensor: Sensor, name: str, frame: Frame) -> ExportedFra
             _refuse_inexpressible(node)
     except (ExportError, SpecError) as refused:
         raise ExportError(f"{sensor.id} {name}: {refused}") from None
-    if not isinstance(root, tree.Struct | tree.Sealed):
+    if not isinstance(root, tree.Struct | tree.ChecksummedStruct):
         raise ExportError(f"{sensor.id} {name}: the frame is not a struct")
     return ExportedFrame(name, frame, root)
 
@@ -217,5 +217,5 @@ def _refuse_inexpressible(node: tree.Node) -> None:
         if not node.inside:
             reason = f"{node.kind} is Python code and cannot be exported"
         raise ExportError(f"{node.info.path}: {reason}")
-    if isinstance(node, tree.Sealed):
+    if isinstance(node, tree.ChecksummedStruct):
         _ = node.algorithm

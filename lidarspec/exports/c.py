@@ -53,11 +53,11 @@ from lidarspec.spec.tree import (
     Blob,
     Block,
     Check,
+    ChecksummedStruct,
     Never,
     Number,
     Op,
     Repeat,
-    Sealed,
     find_runs,
     formulas,
     iter_subformulas,
@@ -257,21 +257,21 @@ def _iter_frame_functions(layout: CLayout, algorithms: Mapping[Checksum, str]) -
     yield _LENGTH.format(
         name=length, unused=unused, checks=checks, size=layout.size, longest=longest
     )
-    seals = dict[str, tuple[CEntry, Sealed]]()
+    checksums = dict[str, tuple[CEntry, ChecksummedStruct]]()
     for entry in layout.entries:
         # If several checksums cover one struct, the outermost is named after the struct, each
         # inner checksum after its field.
-        if isinstance(entry.node, Sealed):
-            if layout.name(entry.path, "checksum_ok") not in seals:
+        if isinstance(entry.node, ChecksummedStruct):
+            if layout.name(entry.path, "checksum_ok") not in checksums:
                 path = entry.path
             else:
                 path = entry.node.fields[0]
-            seals[layout.name(path, "checksum_ok")] = entry, entry.node
-    for name, (entry, seal) in seals.items():
-        yield _format_checksum(layout, entry, seal, name, algorithms[seal.algorithm])
+            checksums[layout.name(path, "checksum_ok")] = entry, entry.node
+    for name, (entry, checksum) in checksums.items():
+        yield _format_checksum(layout, entry, checksum, name, algorithms[checksum.algorithm])
     checksum_checks = [
         _format_check(entry, f"!{name}({format_arguments(entry.depth)})")
-        for name, (entry, _) in seals.items()
+        for name, (entry, _) in checksums.items()
     ]
     yield _IS_FRAME.format(
         name=layout.name("", "is_frame"),
@@ -311,10 +311,10 @@ def _iter_length_checks(layout: CLayout) -> Iterator[str]:
 
 
 def _format_checksum(
-    layout: CLayout, entry: CEntry, seal: Sealed, name: str, algorithm: str
+    layout: CLayout, entry: CEntry, checksum: ChecksummedStruct, name: str, algorithm: str
 ) -> str:
-    checksum_fields = [access for path in seal.fields for access in find_accesses(layout, path)]
-    for path in seal.fields:
+    checksum_fields = [access for path in checksum.fields for access in find_accesses(layout, path)]
+    for path in checksum.fields:
         depths = [access.depth for access in checksum_fields if access.info.path == path]
         if depths != [entry.depth]:
             raise ExportError(
@@ -326,16 +326,16 @@ def _format_checksum(
         arguments=format_arguments(entry.depth),
         spans=", ".join(
             f"{{{start}, {end}}}"
-            for start, end in _iter_covered_spans(layout, entry, seal, checksum_fields)
+            for start, end in _iter_covered_spans(layout, entry, checksum, checksum_fields)
         ),
         algorithm=algorithm,
-        stored=_format_stored_checksum(checksum_fields, seal.algorithm.order),
-        absent="".join(f"stored == UINT64_C({value}) || " for value in seal.absent),
+        stored=_format_stored_checksum(checksum_fields, checksum.algorithm.order),
+        absent="".join(f"stored == UINT64_C({value}) || " for value in checksum.absent),
     )
 
 
 def _iter_covered_spans(
-    layout: CLayout, entry: CEntry, seal: Sealed, checksum_fields: list[CEntry]
+    layout: CLayout, entry: CEntry, checksum: ChecksummedStruct, checksum_fields: list[CEntry]
 ) -> Iterator[tuple[SizeFormula, SizeFormula]]:
     """Yield the byte ranges that a checksum covers.
 
@@ -343,8 +343,8 @@ def _iter_covered_spans(
         entry: the struct with the checksum.
         checksum_fields: the fields that store the checksum.
     """
-    if seal.over is not None:
-        first, last = (layout.find_whole(path) for path in seal.over)
+    if checksum.over is not None:
+        first, last = (layout.find_whole(path) for path in checksum.over)
         yield first.start, last.start + last.size
         return
     start = entry.start
@@ -496,7 +496,7 @@ def header(sensor: Sensor) -> str:
     )
     all_messages = list_frames(sensor)
     algorithms = dict.fromkeys(
-        seal.algorithm for message in all_messages for seal in message.seals.values()
+        checksum.algorithm for message in all_messages for checksum in message.checksums.values()
     )
     names = {
         algorithm: f"{prefix}_checksum_{number}" for number, algorithm in enumerate(algorithms, 1)

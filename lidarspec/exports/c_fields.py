@@ -357,7 +357,7 @@ class CLayout:
         """Yield an entry for each member of a struct."""
         # the entries have the start of the struct instead of the start of the member
         node = entry.node
-        if isinstance(node, tree.Sealed):
+        if isinstance(node, tree.ChecksummedStruct):
             yield replace(entry, node=node.body)
         elif isinstance(node, tree.Struct):
             for member in node.members:

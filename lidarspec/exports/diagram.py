@@ -88,11 +88,11 @@ class _ItemBuilder:
     """Converts the tree of a frame type to items.
 
     Attributes:
-        seals: as in `ExportedFrame`.
+        checksums: as in `ExportedFrame`.
         has_both_orders: whether the frame has numbers in both byte orders.
     """
 
-    seals: Mapping[str, tree.Sealed]
+    checksums: Mapping[str, tree.ChecksummedStruct]
     has_both_orders: bool
 
     def visit(self, node: tree.Node, start: SizeFormula, depth: int) -> tuple[Item, ...]:
@@ -102,7 +102,7 @@ class _ItemBuilder:
             depth: the number of arrays around the node.
         """
         match node:
-            case tree.Sealed():
+            case tree.ChecksummedStruct():
                 return self.visit(node.body, start, depth)
             case tree.Struct():
                 return tuple(self._iter_struct_items(node, start, depth))
@@ -138,7 +138,7 @@ class _ItemBuilder:
         self, node: tree.Struct, start: SizeFormula, depth: int
     ) -> Iterator[Item]:
         for member in node.members:
-            named = isinstance(member, tree.Struct | tree.Sealed) or (
+            named = isinstance(member, tree.Struct | tree.ChecksummedStruct) or (
                 isinstance(member, tree.Block) and member.parts[0].names
             )
             for item in self.visit(member, start, depth):
@@ -217,8 +217,8 @@ class _ItemBuilder:
     def _make_cell(
         self, info: tree.FieldInfo, name: str, bits: int, detail: str, kind: str, start: SizeFormula
     ) -> DiagramBox:
-        seal = self.seals.get(info.path)
-        if seal:
+        checksum = self.checksums.get(info.path)
+        if checksum:
             role = "sum"
         elif info.const is not None:
             role = "const"
@@ -231,7 +231,7 @@ class _ItemBuilder:
             kind,
             format_unit(info),
             describe_field(info),
-            seal.algorithm.describe() if seal else "",
+            checksum.algorithm.describe() if checksum else "",
         )
         tooltip = "; ".join(filter(None, description))
         return DiagramBox(name or "(constant)", bits, detail, tooltip, role, start)
@@ -294,7 +294,7 @@ def svg(sensor: Sensor) -> str:
         )
         sheet.draw_title(f"{sensor.vendor} {sensor.model}: {message.name}", detail)
         sheet.draw_items(
-            _ItemBuilder(message.seals, has_both_orders=not order).visit(
+            _ItemBuilder(message.checksums, has_both_orders=not order).visit(
                 message.root, SizeFormula(), 0
             ),
             0,

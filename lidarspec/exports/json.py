@@ -200,9 +200,9 @@ def node_data(node: tree.Node) -> dict[str, Any]:
                 "name": node.name,
                 "members": [node_data(member) for member in node.members],
             }
-        case tree.Sealed():
+        case tree.ChecksummedStruct():
             body = node_data(node.body)
-            return body | {"checksum": _seal_data(node) | {"inner": body.get("checksum")}}
+            return body | {"checksum": _checksum_data(node) | {"inner": body.get("checksum")}}
         case tree.Number():
             return {
                 "kind": node.kind,
@@ -324,7 +324,7 @@ def _part_data(part: tree.BlockInteger) -> dict[str, Any]:
     return {**head, "runs": runs} | _info_data(part.info)
 
 
-def _seal_data(node: tree.Sealed) -> dict[str, Any]:
+def _checksum_data(node: tree.ChecksummedStruct) -> dict[str, Any]:
     return {
         **select_attributes(node, "fields", "over", "absent"),
         "algorithm": _algorithm_data(node.algorithm),

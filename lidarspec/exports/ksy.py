@@ -351,7 +351,7 @@ def ksy(sensor: Sensor) -> str:
 
 def _frame(sensor: Sensor, message: ExportedFrame) -> Attribute:
     try:
-        return _KaitaiWriter(message.seals).make_struct_type(message.root, ())
+        return _KaitaiWriter(message.checksums).make_struct_type(message.root, ())
     except ExportError as refused:
         raise ExportError(f"{sensor.id} {message.name}: {refused}") from None
 
@@ -398,12 +398,14 @@ class _KaitaiWriter:
     """Writes the types of one frame.
 
     Attributes:
-        seals: as in `ExportedFrame`.
+        checksums: as in `ExportedFrame`.
     """
 
-    seals: Mapping[str, tree.Sealed]
+    checksums: Mapping[str, tree.ChecksummedStruct]
 
-    def make_struct_type(self, node: tree.Struct | tree.Sealed, scope: Scope) -> Attribute:
+    def make_struct_type(
+        self, node: tree.Struct | tree.ChecksummedStruct, scope: Scope
+    ) -> Attribute:
         """Return the Kaitai type of a struct inside the types of `scope`."""
         kaitai = _KaitaiType()
         for member in node.struct.members:
@@ -505,7 +507,7 @@ class _KaitaiWriter:
 
     def _make_type(self, node: tree.Node, scope: Scope) -> Attribute:
         """Return the Kaitai type of a node."""
-        if isinstance(node, tree.Struct | tree.Sealed):
+        if isinstance(node, tree.Struct | tree.ChecksummedStruct):
             return self.make_struct_type(node, scope)
         kaitai = _KaitaiType()
         if isinstance(node, tree.Block):
@@ -586,17 +588,21 @@ class _KaitaiWriter:
         return head | {"type": f"{letter}{node.size}{order}"} | const | self._make_doc(node.info)
 
     def _make_doc(self, info: tree.FieldInfo) -> Attribute:
-        seal = self.seals.get(info.path)
-        if seal is None:
-            sealed = ""
+        checksum = self.checksums.get(info.path)
+        if checksum is None:
+            checksum_note = ""
         else:
-            covered = _describe_covered(seal)
-            sealed = f"{seal.algorithm.describe()} over {covered}, which is not checked here"
+            covered = _describe_covered(checksum)
+            checksum_note = (
+                f"{checksum.algorithm.describe()} over {covered}, which is not checked here"
+            )
         if info.is_enforced:
             unchecked = "a length, which is not checked here"
         else:
             unchecked = ""
-        text = "; ".join(filter(None, (format_unit(info), describe_field(info), unchecked, sealed)))
+        text = "; ".join(
+            filter(None, (format_unit(info), describe_field(info), unchecked, checksum_note))
+        )
         if text:
             return {"doc": text}
         return {}
@@ -648,15 +654,15 @@ def _rename_to_value(node: tree.Node) -> tree.Node:
     if isinstance(node, tree.Number):
         parent = node.info.path.rpartition(".")[0]
         return replace(node, info=replace(node.info, path=f"{parent}.value" if parent else "value"))
-    if isinstance(node, tree.Sealed | tree.Derived):
+    if isinstance(node, tree.ChecksummedStruct | tree.Derived):
         return node
     return replace(node, name="value")
 
 
-def _describe_covered(seal: tree.Sealed) -> str:
-    if seal.over is None:
+def _describe_covered(checksum: tree.ChecksummedStruct) -> str:
+    if checksum.over is None:
         return "all other bytes"
-    first, last = (path.rpartition(".")[2] for path in seal.over)
+    first, last = (path.rpartition(".")[2] for path in checksum.over)
     if first == last:
         return first
     return f"{first} to {last}"

@@ -26,6 +26,7 @@ from lidarspec.spec.tree import (
     Blob,
     Block,
     Check,
+    ChecksummedStruct,
     Derived,
     Empty,
     FieldInfo,
@@ -35,7 +36,6 @@ from lidarspec.spec.tree import (
     Opaque,
     PartSequence,
     Repeat,
-    Sealed,
     Select,
     Struct,
     When,
@@ -98,7 +98,7 @@ class _StubClasses:
     taken: set[str]
     done: list[str] = field(default_factory=list)
 
-    def add(self, node: Struct | Sealed | Block, name: str, docstring: str) -> str:
+    def add(self, node: Struct | ChecksummedStruct | Block, name: str, docstring: str) -> str:
         """Add the class of a struct or block, and return its name.
 
         Args:
@@ -120,9 +120,9 @@ class _StubClasses:
         return name
 
     def _write_members(
-        self, node: Struct | Sealed | Block
+        self, node: Struct | ChecksummedStruct | Block
     ) -> Iterator[tuple[str, Node | list[FieldInfo]]]:
-        if isinstance(node, Struct | Sealed):
+        if isinstance(node, Struct | ChecksummedStruct):
             yield from ((member.name, member) for member in node.struct.members if member.name)
         else:
             for name in dict.fromkeys(part.names[0] for part in node.parts):
@@ -167,7 +167,7 @@ class _StubClasses:
                 if len(node.parts) == 1:
                     return _find_number_type(node.parts[0].info)
                 return "list[int]"
-            case Struct() | Sealed() | Block():
+            case Struct() | ChecksummedStruct() | Block():
                 return self.add(node, owner + to_class_name(name), f"`{name}` of `{owner}`.")
             case Repeat():
                 return f"list[{self._type(owner, name, node.element)}]"

@@ -351,13 +351,13 @@ function step.check(self, node, tree)
 end
 
 -- What is stored, low bits first, and what should be.
-function Walk:stored(seal)
+function Walk:stored(declared)
   local total, weight = 0, 1
-  for _, held in ipairs(seal.fields) do
+  for _, held in ipairs(declared.fields) do
     local value = self.values[held.path]
     if type(value) == "string" then
       local number = 0
-      for spot = 1, #value do number = number * 256 + value:byte(seal.big and spot or #value + 1 - spot) end
+      for spot = 1, #value do number = number * 256 + value:byte(declared.big and spot or #value + 1 - spot) end
       value = number
     end
     total, weight = total + value % 2 ^ held.width * weight, weight * 2 ^ held.width
@@ -365,10 +365,10 @@ function Walk:stored(seal)
   return total
 end
 
-function Walk:covered(seal, from)
-  if seal.first then return self.tvb:raw(self.places[seal.first][1], self.places[seal.last][2] - self.places[seal.first][1]) end
+function Walk:covered(declared, from)
+  if declared.first then return self.tvb:raw(self.places[declared.first][1], self.places[declared.last][2] - self.places[declared.first][1]) end
   local held, parts = {}, {}
-  for _, field in ipairs(seal.fields) do table.insert(held, self.places[field.path]) end
+  for _, field in ipairs(declared.fields) do table.insert(held, self.places[field.path]) end
   table.sort(held, function(a, b) return a[1] < b[1] end)
   for _, place in ipairs(held) do
     table.insert(parts, place[1] > from and self.tvb:raw(from, place[1] - from) or "")
@@ -380,27 +380,27 @@ end
 
 local function hex(value) return type(value) == "number" and string.format("0x%x", value) or "0x" .. value:tohex() end
 
-function step.sealed(self, node, tree, label)
+function step.checksummed(self, node, tree, label)
   local from = self.at
   self:visit(node.body, tree, label)
-  local seal = node.seal
-  local data = self:covered(seal, from)
-  if seal.pad then data = data .. string.rep("\0", -#data % seal.pad) end
-  local stored, computed = self:stored(seal), checksum[seal.algorithm](seal, data)
-  local is_absent = seal.absent[stored]
+  local declared = node.checksum
+  local data = self:covered(declared, from)
+  if declared.pad then data = data .. string.rep("\0", -#data % declared.pad) end
+  local stored, computed = self:stored(declared), checksum[declared.algorithm](declared, data)
+  local is_absent = declared.absent[stored]
   local is_right = stored == plain(computed) or is_absent
-  if seal.is_wide and type(computed) ~= "number" then
-    stored = self.exact[seal.fields[1].path]
+  if declared.is_wide and type(computed) ~= "number" then
+    stored = self.exact[declared.fields[1].path]
     is_right = stored == computed or is_absent
   end
   if not is_right then self.wrong = self.wrong or "checksum" end
-  local item = tree and self.items[seal.fields[1].path]
+  local item = tree and self.items[declared.fields[1].path]
   if item then
     item:append_text(is_absent and " [not filled]" or is_right and " [correct]" or " [wrong, should be " .. hex(computed) .. "]")
     if not is_right then
       item:add_proto_expert_info(marks.checksum, string.format("checksum is %s, should be %s", hex(stored), hex(computed)))
     end
-    local place = self.places[seal.fields[1].path]
+    local place = self.places[declared.fields[1].path]
     item:add(status, self.tvb(place[1], place[2] - place[1]), is_absent and 2 or is_right and 1 or 0):set_generated(true)
   end
 end

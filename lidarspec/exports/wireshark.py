@@ -152,9 +152,11 @@ class _TableWriter:
             path for node in tree.nodes(message.root) for path in find_required_formulas(node)
         }
         self.kept = (
-            {ref.path for ref in find_references(message.root)} | message.seals.keys() | lengths
+            {ref.path for ref in find_references(message.root)} | message.checksums.keys() | lengths
         )
-        self.marked = {path for seal in message.seals.values() for path in seal.over or ()}
+        self.marked = {
+            path for checksum in message.checksums.values() for path in checksum.over or ()
+        }
         self.types: dict[str, str] = {}
 
     def make_table(self, node: tree.Node, path: str = "") -> Table:
@@ -168,12 +170,12 @@ class _TableWriter:
                 return self._make_block_table(node)
             case tree.Struct():
                 return self._make_struct_table(node)
-            case tree.Sealed():
+            case tree.ChecksummedStruct():
                 return {
-                    "kind": "sealed",
+                    "kind": "checksummed",
                     "name": node.name or None,
                     "body": self.make_table(node.body),
-                    "seal": self._make_seal_table(node),
+                    "checksum": self._make_checksum_table(node),
                 }
             case tree.Repeat():
                 return self._make_repeat_table(node, path)
@@ -383,9 +385,9 @@ class _TableWriter:
         self, info: tree.FieldInfo, kind: str, mask: int | None = None
     ) -> Table:
         """Return the table entries of a number: unit, scale, labels, limits, ProtoFields."""
-        is_hex = (info.path in self.message.seals or info.const is not None) and kind.startswith(
-            "UINT"
-        )
+        is_hex = (
+            info.path in self.message.checksums or info.const is not None
+        ) and kind.startswith("UINT")
         if is_hex:
             shown = "HEX"
         elif kind in ("FLOAT", "DOUBLE"):
@@ -458,7 +460,7 @@ class _TableWriter:
             return None
         return size
 
-    def _make_seal_table(self, node: tree.Sealed) -> Table:
+    def _make_checksum_table(self, node: tree.ChecksummedStruct) -> Table:
         widths = {info.path: info.bits for below in tree.nodes(node) for info in tree.infos(below)}
         return {
             **_make_algorithm_table(node.algorithm),

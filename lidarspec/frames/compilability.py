@@ -33,7 +33,7 @@ def _check(node: tree.Node, path: str, *, is_in_array: bool) -> None:
     match node:
         case tree.Opaque():
             raise NotCompilableError(node.info.path, node.reason)
-        case tree.Sealed():
+        case tree.ChecksummedStruct():
             if is_in_array:
                 raise NotCompilableError(path, "the checksum is inside an array")
             _ = node.algorithm

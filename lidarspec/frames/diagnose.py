@@ -124,12 +124,12 @@ def _iter_faults(examined: ExaminedFrame) -> Iterator[Fault]:
         if fault is not None:
             yield fault
     yield from _iter_layout_faults(examined)
-    for seal in examined.seals():
-        if not seal.is_right:
-            digits = (sum(leaf.info.bits for leaf in seal.seal.leaves) + 3) // 4
-            expected = f"0x{seal.computed:0{digits}x}"
-            got = f"0x{seal.stored:0{digits}x}"
-            yield Fault(CHECKSUM, seal.path, seal.offset, expected, got, seal.end)
+    for checksum in examined.checksums():
+        if not checksum.is_right:
+            digits = (sum(leaf.info.bits for leaf in checksum.checksum.leaves) + 3) // 4
+            expected = f"0x{checksum.computed:0{digits}x}"
+            got = f"0x{checksum.stored:0{digits}x}"
+            yield Fault(CHECKSUM, checksum.path, checksum.offset, expected, got, checksum.end)
     part = _find_open_part(examined)
     if part is not None:
         yield from _iter_faults(part)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import MissingField, OutOfRange, UsageError
 from lidarspec.frames.field_paths import split_path
-from lidarspec.frames.layout import Layout, Leaf, Seal
+from lidarspec.frames.layout import FrameChecksum, Layout, Leaf
 from lidarspec.frames.layout_tree import InvalidCaseError, InvalidLengthError, find_kinds
 from lidarspec.frames.measured_size import FOUND, MeasuredSize
 from lidarspec.frames.parts import LayoutLookup
@@ -31,6 +31,7 @@ from lidarspec.spec.tree import (
     Adapter,
     Blob,
     Block,
+    ChecksummedStruct,
     FieldInfo,
     Formula,
     Kind,
@@ -39,7 +40,6 @@ from lidarspec.spec.tree import (
     PartSequence,
     Read,
     Repeat,
-    Sealed,
     Select,
     Struct,
     When,
@@ -104,8 +104,8 @@ class _Encoder:
             self._totals[node.total.path] = sum(map(len, parts[axis]))
         self._measure_texts()
         layout = self._find_layout()
-        for seal in layout.seals:
-            for leaf in seal.leaves:
+        for checksum in layout.checksums:
+            for leaf in checksum.leaves:
                 self._checksums.add(leaf.info.path)
         for axis in layout.regions:
             if axis not in parts:
@@ -118,10 +118,10 @@ class _Encoder:
         for axis, region in layout.regions.items():
             data = b"".join(parts[axis])
             row[0, region.start : region.start + len(data)] = np.frombuffer(data, np.uint8)
-        layout.seal_header(row)
-        for seal in layout.seals:
-            if not self._is_absent(seal, row):
-                seal.fill(row)
+        layout.complete_header(row)
+        for checksum in layout.checksums:
+            if not self._is_absent(checksum, row):
+                checksum.fill(row)
         self._check(layout, row, parts)
         return row.tobytes()
 
@@ -251,7 +251,7 @@ class _Encoder:
             shown: the path of the node with indices.
         """
         match node:
-            case Sealed():
+            case ChecksummedStruct():
                 self._collect(node.body, value, path, shown, layout)
             case Struct():
                 self._collect_struct(node, value, shown, layout)
@@ -427,13 +427,13 @@ class _Encoder:
             if isinstance(value, WireNaN) and len(value.raw) == leaf.size:
                 row[0, offset : offset + leaf.size] = np.frombuffer(value.raw, np.uint8)
 
-    def _is_absent(self, seal: Seal, row: NDArray[np.uint8]) -> bool:
-        """Return whether the caller's checksum stands for "no checksum" (`Seal.absent`)."""
-        if not seal.absent or any(
-            get_member(self._given, leaf.info.path, None) is None for leaf in seal.leaves
+    def _is_absent(self, checksum: FrameChecksum, row: NDArray[np.uint8]) -> bool:
+        """Return whether the caller gave a value that means "no checksum"."""
+        if not checksum.absent or any(
+            get_member(self._given, leaf.info.path, None) is None for leaf in checksum.leaves
         ):
             return False
-        return int(seal.load_stored(row)[0]) in seal.absent
+        return int(checksum.load_stored(row)[0]) in checksum.absent
 
     def _check(
         self, layout: Layout, row: NDArray[np.uint8], parts: Mapping[str, list[bytes]]

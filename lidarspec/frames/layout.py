@@ -1,8 +1,9 @@
 """Layouts: the positions of all fields of a frame, for loading and storing values.
 
 A `Layout` describes the frames of one header variant. `lidarspec.frames.layout_tree` makes it from
-the frame tree. A `Leaf` is the position of one field. A `Seal` is a checksum: the fields that store
-it, and the bytes that it covers. Most functions handle many frames at once, given as rows of bytes.
+the frame tree. A `Leaf` is the position of one field. A `FrameChecksum` has the fields that store a
+checksum, and the bytes that the checksum covers. Most functions handle many frames at once, given
+as rows of bytes.
 """
 
 from __future__ import annotations
@@ -394,13 +395,13 @@ class Derivation:
         return replace(self, info=info, picked=picked)
 
 
-#: A function that computes the checksums of one seal for many frames, (n,). It returns None if the
-#: algorithm of the seal has to compute them.
-Sums = Callable[["Seal", Bytes2D], "NDArray[np.uint64] | None"]
+#: A function that computes one checksum of many frames, (n,). It returns None if the algorithm of
+#: the checksum has to compute it.
+Sums = Callable[["FrameChecksum", Bytes2D], "NDArray[np.uint64] | None"]
 
 
 @dataclass(frozen=True, eq=False)
-class Seal:
+class FrameChecksum:
     """A checksum of the frame.
 
     Attributes:
@@ -416,7 +417,7 @@ class Seal:
     #: The offset after the last byte of the struct with the checksum.
     end: int = 0
 
-    def covers(self, other: Seal) -> bool:
+    def covers(self, other: FrameChecksum) -> bool:
         """Return whether this checksum covers the bytes of another checksum."""
         return any(
             start < leaf.byte_span[1] and leaf.byte_span[0] < end
@@ -450,7 +451,7 @@ class Seal:
 
         Args:
             sums: a function that computes some checksums faster. If it is None or returns None,
-                the algorithm of the seal is used.
+                the algorithm of the checksum is used.
         """
         values = None if sums is None else sums(self, rows)
         if values is None:
@@ -621,7 +622,7 @@ class Layout:
         size: the size of the frames in bytes.
         leaves: the position of each field, by path.
         constants: the constant bits, as (mask, value) by offset.
-        seals: the checksums, inner checksums first.
+        checksums: the checksums, inner checksums first.
         places: the byte range of each named field, struct and array outside other arrays, by path.
         branches: the branch that each `When` and `Select` takes.
         following: the fields whose values the header implies, each with its value.
@@ -637,7 +638,7 @@ class Layout:
     size: int
     leaves: Mapping[str, Leaf]
     constants: Mapping[int, tuple[int, int]]
-    seals: tuple[Seal, ...]
+    checksums: tuple[FrameChecksum, ...]
     places: Mapping[str, tuple[int, int]]
     branches: Mapping[Node, Node] = field(default_factory=dict)
     following: tuple[tuple[Leaf, int], ...] = ()
@@ -684,7 +685,7 @@ class Layout:
         return (
             len(frame) == self.size
             and int.from_bytes(frame, "little") & self._mask == self._value
-            and all(part.is_valid(frame) for part in (*self.seals, *self.regions.values()))
+            and all(part.is_valid(frame) for part in (*self.checksums, *self.regions.values()))
             and (
                 not self.conditions
                 or self.meet_conditions(np.frombuffer(frame, np.uint8).reshape(1, -1)).item()
@@ -702,13 +703,13 @@ class Layout:
         """Return whether each frame, given as a row of bytes, meets a condition, (n,)."""
         return find_passing(condition, self.leaves, rows)
 
-    def seal(self, rows: Bytes2D) -> None:
+    def complete_rows(self, rows: Bytes2D) -> None:
         """Write constants, lengths and checksums into frames given as rows of bytes."""
-        self.seal_header(rows)
-        for seal in self.seals:
-            seal.fill(rows)
+        self.complete_header(rows)
+        for checksum in self.checksums:
+            checksum.fill(rows)
 
-    def seal_header(self, rows: Bytes2D) -> None:
+    def complete_header(self, rows: Bytes2D) -> None:
         """Write constants, and values that the header implies, into rows of bytes."""
         for leaf, value in self.following:
             leaf.store(rows, value)

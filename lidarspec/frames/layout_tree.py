@@ -26,7 +26,14 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.frames.arrays import group_by_value
 from lidarspec.frames.compilability import NotCompilableError, check_compilable
-from lidarspec.frames.layout import Condition, Derivation, Layout, LayoutRefusal, Leaf, Seal
+from lidarspec.frames.layout import (
+    Condition,
+    Derivation,
+    FrameChecksum,
+    Layout,
+    LayoutRefusal,
+    Leaf,
+)
 from lidarspec.frames.measured_size import MeasuredSize, TextSize
 from lidarspec.frames.parts import CONSTANT, FAILED, PartKind, PartRule, PartsSize, Region
 from lidarspec.frames.schema import PathMapping, make_schema, without_indices
@@ -136,7 +143,7 @@ class HeaderWalk:
     cursor: int = 0
     leaves: dict[str, Leaf] = field(default_factory=dict)
     constants: dict[int, tuple[int, int]] = field(default_factory=dict)
-    seals: list[Seal] = field(default_factory=list)
+    checksums: list[FrameChecksum] = field(default_factory=list)
     places: dict[str, tuple[int, int]] = field(default_factory=dict)
     branches: dict[tree.Node, tree.Node] = field(default_factory=dict)
     lengths: dict[str, int] = field(default_factory=dict)
@@ -158,14 +165,14 @@ class HeaderWalk:
         """Return the layout that the walk found."""
         held = self._find_size_bits()
         self.request = _raise_unknown  # the layout is known, so no other field may be requested
-        seals = tuple(_order_seals(self.seals))
+        checksums = tuple(_order_checksums(self.checksums))
         following = tuple(self._iter_following())
         leaves = PathMapping(self.leaves, Leaf.element)
         found = (
             self.cursor,
             leaves,
             self.constants,
-            seals,
+            checksums,
             self.places,
             self.branches,
             following,
@@ -220,9 +227,9 @@ class HeaderWalk:
         match node:
             case tree.Struct():
                 self._add_struct(node, path, shape, strides)
-            case tree.Sealed():
+            case tree.ChecksummedStruct():
                 self.visit(node.body, path, shape, strides)
-                self._add_seal(node, start)
+                self._add_checksum(node, start)
             case tree.Number() | tree.Blob() | tree.Block():
                 self._add_field(node, path, shape, strides)
             case tree.Repeat():
@@ -453,7 +460,7 @@ class HeaderWalk:
         if leaf.shape and (leaf.info.kind == "bytes" or is_in_block):
             self.lengths[leaf.info.axes[-1]] = 0 if 0 in leaf.shape[:-1] else leaf.shape[-1]
 
-    def _add_seal(self, node: tree.Sealed, start: int) -> None:
+    def _add_checksum(self, node: tree.ChecksummedStruct, start: int) -> None:
         leaves = tuple(self.leaves[path] for path in node.fields)
         if node.over is not None:
             spans = [(self.places[node.over[0]][0], self.places[node.over[1]][1])]
@@ -461,7 +468,9 @@ class HeaderWalk:
             held = sorted(leaf.byte_span for leaf in leaves)
             edges = [start, *(edge for span in held for edge in span), self.cursor]
             spans = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
-        self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent, self.cursor))
+        self.checksums.append(
+            FrameChecksum(leaves, tuple(spans), node.algorithm, node.absent, self.cursor)
+        )
 
     def _find_size_bits(self) -> dict[int, tuple[int, int]]:
         """Return the bits that the fields with `SizeOf` must have.
@@ -518,14 +527,14 @@ def _set_stride(leaves: dict[str, Any], axis: str, depth: int, size: int) -> Non
             leaves[path] = replace(leaf, strides=strides)
 
 
-def _order_seals(seals: list[Seal]) -> Iterator[Seal]:
+def _order_checksums(checksums: list[FrameChecksum]) -> Iterator[FrameChecksum]:
     """Yield checksums in the order in which they can be computed."""
-    left = list(seals)
+    left = list(checksums)
     while left:
         free = (
-            seal
-            for seal in left
-            if not any(seal.covers(other) for other in left if other is not seal)
+            checksum
+            for checksum in left
+            if not any(checksum.covers(other) for other in left if other is not checksum)
         )
         left.remove(first := next(free, left[0]))
         yield first

@@ -33,13 +33,13 @@ from lidarspec.spec.tree import (
     Adapter,
     Blob,
     Block,
+    ChecksummedStruct,
     Derived,
     FieldInfo,
     Node,
     Number,
     PartSequence,
     Repeat,
-    Sealed,
     Select,
     Struct,
     When,
@@ -302,7 +302,7 @@ def _make_reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
     if count == 0:
         return _read_no_values
     match node:
-        case Sealed():
+        case ChecksummedStruct():
             return _make_reader(node.body, path, layout, count)
         case Struct():
             members = [

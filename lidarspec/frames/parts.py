@@ -85,7 +85,7 @@ class PartKind:
     def is_checked(self) -> bool:
         """Whether parts of this kind, or the parts in them, have checksums or conditions."""
         return any(
-            isinstance(node, tree.Sealed | tree.Check)
+            isinstance(node, tree.ChecksummedStruct | tree.Check)
             or any(info.allowed for info in tree.infos(node))
             for node in tree.nodes(self.node.root)
         )

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarspec.frames.layout import Layout, Leaf, Seal
+from lidarspec.frames.layout import FrameChecksum, Layout, Leaf
 from lidarspec.frames.layout_tree import HeaderWalk, UnknownSelectorError, walk_layout
 from lidarspec.frames.measured_size import FOUND, MeasuredSize
 from lidarspec.frames.parts import PartKind, Region
@@ -53,13 +53,13 @@ class WireField:
 
 
 @dataclass(frozen=True)
-class PlacedSeal:
+class ExaminedChecksum:
     """A checksum in the bytes of a frame.
 
     `prefix` is the path of the part that contains the checksum; "" if it is not in a part.
     """
 
-    seal: Seal
+    checksum: FrameChecksum
     prefix: str
     start: int
     stored: int
@@ -68,22 +68,22 @@ class PlacedSeal:
     @property
     def path(self) -> str:
         """The path of the field that contains the checksum, or of the first such field."""
-        return f"{self.prefix}.{self.seal.leaves[0].info.path}".strip(".")
+        return f"{self.prefix}.{self.checksum.leaves[0].info.path}".strip(".")
 
     @property
     def offset(self) -> int:
         """The offset of the first byte of the checksum."""
-        return self.start + self.seal.leaves[0].byte_span[0]
+        return self.start + self.checksum.leaves[0].byte_span[0]
 
     @property
     def end(self) -> int:
         """The offset after the last byte of the struct with the checksum."""
-        return self.start + self.seal.end
+        return self.start + self.checksum.end
 
     @property
     def is_right(self) -> bool:
         """Whether the stored checksum is correct, or states that there is no checksum."""
-        return self.stored == self.computed or self.stored in self.seal.absent
+        return self.stored == self.computed or self.stored in self.checksum.absent
 
 
 @dataclass(frozen=True)
@@ -135,20 +135,20 @@ class ExaminedFrame:
         cursor = _Cursor(self)
         yield from cursor.visit(self.root, "", self.prefix)
 
-    def seals(self) -> Iterator[PlacedSeal]:
+    def checksums(self) -> Iterator[ExaminedChecksum]:
         """Yield the checksums of complete structs, inner checksums first."""
         rows = np.frombuffer(self.data, np.uint8).reshape(1, -1)
-        for seal in self.known.seals:
-            if seal.end <= len(self.data):
-                stored = int(seal.load_stored(rows)[0])
-                computed = int(seal.compute(rows)[0])
-                yield PlacedSeal(seal, self.prefix, self.start, stored, computed)
+        for checksum in self.known.checksums:
+            if checksum.end <= len(self.data):
+                stored = int(checksum.load_stored(rows)[0])
+                computed = int(checksum.compute(rows)[0])
+                yield ExaminedChecksum(checksum, self.prefix, self.start, stored, computed)
         axes = [*self.known.regions]
         if isinstance(self.known, HeaderWalk):
             axes += [axis for axis in self.known.open_regions if axis not in axes]
         for axis in axes:
             for part in self.list_parts_of(axis):
-                yield from part.seals()
+                yield from part.checksums()
 
     def region(self, axis: str) -> Region | None:
         """Return the region of the parts at a path; None if it is not known."""
@@ -287,7 +287,7 @@ class _Cursor:
         if self._is_over:
             return
         match node:
-            case tree.Sealed():
+            case tree.ChecksummedStruct():
                 yield from self.visit(node.body, path, shown)
             case tree.Struct():
                 for child in node.members:

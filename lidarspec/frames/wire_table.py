@@ -85,13 +85,13 @@ class SizeFormula:
 
 def wire_table(frame: Frame) -> tuple[WireRow, ...]:
     """Return the rows of a frame type in wire order."""
-    seals = {
-        path: _describe_seal(node)
+    checksums = {
+        path: _describe_checksum(node)
         for node in tree.nodes(frame.tree)
-        if isinstance(node, tree.Sealed)
+        if isinstance(node, tree.ChecksummedStruct)
         for path in node.fields
     }
-    return tuple(_iter_rows(frame.tree, "", SizeFormula(), "", seals))
+    return tuple(_iter_rows(frame.tree, "", SizeFormula(), "", checksums))
 
 
 def frame_size(frame: Frame) -> str:
@@ -118,7 +118,7 @@ def extent(node: tree.Node, shown: str = "") -> SizeFormula:
                 (extent(member, _make_member_path(shown, member)) for member in node.members),
                 SizeFormula(),
             )
-        case tree.Sealed():
+        case tree.ChecksummedStruct():
             return extent(node.body, shown)
         case tree.Repeat():
             return extent(node.element, _make_element_path(shown)[0]).times(_format_count(node))
@@ -161,17 +161,17 @@ def _make_element_path(shown: str) -> tuple[str, str]:
 
 
 def _iter_rows(
-    node: tree.Node, shown: str, start: SizeFormula, condition: str, seals: Mapping[str, str]
+    node: tree.Node, shown: str, start: SizeFormula, condition: str, checksums: Mapping[str, str]
 ) -> Iterator[WireRow]:
     """Yield the rows of a node that begins at `start` and exists under a condition."""
     match node:
         case tree.Struct():
             for member in node.members:
                 below = _make_member_path(shown, member)
-                yield from _iter_rows(member, below, start, condition, seals)
+                yield from _iter_rows(member, below, start, condition, checksums)
                 start = start + extent(member, below)
-        case tree.Sealed():
-            yield from _iter_rows(node.body, shown, start, condition, seals)
+        case tree.ChecksummedStruct():
+            yield from _iter_rows(node.body, shown, start, condition, checksums)
         case tree.Repeat():
             element, index = _make_element_path(shown)
             size = extent(node.element, element)
@@ -180,7 +180,7 @@ def _iter_rows(
                 str(start), str(size.times(_format_count(node))), "array", shown, "", says
             )
             yield from _iter_rows(
-                node.element, element, start + size.times(index), condition, seals
+                node.element, element, start + size.times(index), condition, checksums
             )
         case tree.PartSequence():
             element, _ = _make_element_path(shown)
@@ -195,11 +195,11 @@ def _iter_rows(
             for kind in node.kinds:
                 said = f"in parts of kind {kind.name}" if kind.name else ""
                 yield from _iter_rows(
-                    kind.element, element, SizeFormula(0, (f"at({element})",)), said, seals
+                    kind.element, element, SizeFormula(0, (f"at({element})",)), said, checksums
                 )
         case tree.When() | tree.Select():
             for condition_text, branch in list_branches(node):
-                yield from _iter_rows(branch, shown, start, condition_text, seals)
+                yield from _iter_rows(branch, shown, start, condition_text, checksums)
         case tree.Check():
             yield WireRow(
                 str(start),
@@ -219,7 +219,7 @@ def _iter_rows(
                     *_describe_bits(part),
                     _make_part_path(shown, part),
                     condition,
-                    seals,
+                    checksums,
                 )
         case tree.Number() | tree.Blob() | tree.Opaque():
             if isinstance(node, tree.Opaque) and node.size is None:
@@ -230,7 +230,9 @@ def _iter_rows(
                 info = replace(node.info, const=node.const)
             else:
                 info = node.info
-            yield _make_row(info, str(start), length, _describe_type(node), shown, condition, seals)
+            yield _make_row(
+                info, str(start), length, _describe_type(node), shown, condition, checksums
+            )
 
 
 def _make_row(
@@ -240,9 +242,9 @@ def _make_row(
     kind: str,
     shown: str,
     condition: str,
-    seals: Mapping[str, str],
+    checksums: Mapping[str, str],
 ) -> WireRow:
-    says = "; ".join(filter(None, (condition, describe_field(info), seals.get(info.path, ""))))
+    says = "; ".join(filter(None, (condition, describe_field(info), checksums.get(info.path, ""))))
     return WireRow(offset, size, kind, shown, format_unit(info), says)
 
 
@@ -393,7 +395,7 @@ def format_hex(value: object, bits: int) -> str:
     return repr(value)
 
 
-def _describe_seal(node: tree.Sealed) -> str:
+def _describe_checksum(node: tree.ChecksummedStruct) -> str:
     """Return a description of a checksum, with the range of bytes that it covers."""
     if node.declared:
         name = node.declared.describe()

@@ -292,7 +292,7 @@ def _fill_headers(
         leaf = layout.column(path)
         assert isinstance(leaf, Leaf)
         leaf.store(rows, value)
-    layout.seal(rows)
+    layout.complete_rows(rows)
     return rows
 
 

@@ -32,10 +32,10 @@ from lidarspec.frames.arrays import take_rows
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows, Table
 from lidarspec.frames.layout import (
     Bytes2D,
+    FrameChecksum,
     FrameTest,
     Layout,
     Leaf,
-    Seal,
     Sums,
     find_passing,
     gather_rows,
@@ -117,8 +117,8 @@ class CandidateChecker:
         status = np.zeros(len(rows), np.uint8)
         self.check_constants(status, rows)
         _check_valid_parts(self._layout, status, rows, errors, sums)
-        for seal in self._layout.seals:
-            _check_valid(status, rows, functools.partial(check_seal, seal, errors, sums))
+        for checksum in self._layout.checksums:
+            _check_valid(status, rows, functools.partial(check_checksum, checksum, errors, sums))
         if np.count_nonzero(status) == len(status):
             return status
         self._check(status, rows, self._struct_checks)
@@ -191,8 +191,8 @@ def _check_parts(
         parts = gather_rows(buffer, piece.offsets, piece.layout.size)
         verdicts = np.zeros(len(parts), np.uint8)
         _check_valid_parts(piece.layout, verdicts, parts, errors, sums)
-        for seal in piece.layout.seals:
-            _check_valid(verdicts, parts, functools.partial(check_seal, seal, errors, sums))
+        for checksum in piece.layout.checksums:
+            _check_valid(verdicts, parts, functools.partial(check_checksum, checksum, errors, sums))
         if piece.layout.conditions:
             verdicts[(verdicts == VALID) & ~piece.layout.meet_conditions(parts)] = IMPLAUSIBLE
         bad = (verdicts != VALID) & (status[piece.owners] == VALID)
@@ -200,15 +200,15 @@ def _check_parts(
     return status
 
 
-def check_seal(
-    seal: Seal, errors: list[PluginError], sums: Sums | None, rows: Bytes2D
+def check_checksum(
+    checksum: FrameChecksum, errors: list[PluginError], sums: Sums | None, rows: Bytes2D
 ) -> NDArray[np.uint8]:
     """Check one checksum of each frame, and return the status of each frame, (n,).
 
     The status is `VALID`, `CHECKSUM` if the checksum is wrong, or `PLUGIN` if the plugin failed.
     """
     try:
-        wrong = ~seal.are_valid(rows, sums)
+        wrong = ~checksum.are_valid(rows, sums)
         return np.multiply(wrong.view(np.uint8), np.uint8(CHECKSUM))
     except Exception as error:
         errors.append(PluginError.of(error, "checksum"))

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.frames.layout import Bytes2D, Layout, Leaf, Seal, Sums, gather_rows
+from lidarspec.frames.layout import Bytes2D, FrameChecksum, Layout, Leaf, Sums, gather_rows
 from lidarspec.framing.plausibility import CandidateChecker, Check, LookupCondition
 from lidarspec.framing.results import CHECKSUM, IMPLAUSIBLE, VALID
 from lidarspec.spec.checksums import Checksum, Sum, WordXor, Xor
@@ -99,13 +99,17 @@ class LayoutFamilies:
         return family
 
     def _make_family(self, layout: Layout, checker: CandidateChecker) -> LayoutFamily | None:
-        if layout.regions or not all(_ignores_trailing_zeros(seal) for seal in layout.seals):
+        if layout.regions or not all(
+            _ignores_trailing_zeros(checksum) for checksum in layout.checksums
+        ):
             return None
         constants = tuple(sorted(layout.constants.items()))
         lengths = tuple(sorted(layout.held.items()))
-        seals = tuple(_make_seal_key(seal, layout.size) for seal in layout.seals)
+        checksums = tuple(
+            _make_checksum_key(checksum, layout.size) for checksum in layout.checksums
+        )
         tests = tuple(_make_test_key(check) for check in checker.checks)
-        key = constants, lengths, seals, tests, checker.is_complete
+        key = constants, lengths, checksums, tests, checker.is_complete
         if key not in self._numbers:
             if len(self._numbers) >= MAX_KEYS:
                 self._numbers.clear()
@@ -113,23 +117,29 @@ class LayoutFamilies:
         return LayoutFamily(self._numbers[key], tuple(map(_find_length, checker.checks)))
 
 
-def _ignores_trailing_zeros(seal: Seal) -> bool:
+def _ignores_trailing_zeros(checksum: FrameChecksum) -> bool:
     """Return whether zeros after the covered bytes leave a checksum unchanged."""
-    return type(seal.algorithm) in ZERO_EXTENDED and bool(seal.spans)
+    return type(checksum.algorithm) in ZERO_EXTENDED and bool(checksum.spans)
 
 
-def _make_seal_key(seal: Seal, size: int) -> Hashable:
-    *spans, (start, stop) = seal.spans
+def _make_checksum_key(checksum: FrameChecksum, size: int) -> Hashable:
+    *spans, (start, stop) = checksum.spans
     leaves = tuple(
-        (_find_checksum_position(leaf, seal, size), leaf.size, leaf.shape, leaf.wire, leaf.elements)
-        for leaf in seal.leaves
+        (
+            _find_checksum_position(leaf, checksum, size),
+            leaf.size,
+            leaf.shape,
+            leaf.wire,
+            leaf.elements,
+        )
+        for leaf in checksum.leaves
     )
-    return seal.algorithm, seal.absent, tuple(spans), start, size - stop, leaves
+    return checksum.algorithm, checksum.absent, tuple(spans), start, size - stop, leaves
 
 
-def _find_checksum_position(leaf: Leaf, seal: Seal, size: int) -> tuple[str, int]:
+def _find_checksum_position(leaf: Leaf, checksum: FrameChecksum, size: int) -> tuple[str, int]:
     """Return the position of a checksum, counted from the start or the end of the frame."""
-    if leaf.offset >= seal.spans[-1][1]:
+    if leaf.offset >= checksum.spans[-1][1]:
         return ("end", size - leaf.offset)
     return ("start", leaf.offset)
 
@@ -203,8 +213,8 @@ class JointChecker:
         checker = self._make_checker(self.layouts[longest])
         status = np.zeros(len(rows), np.uint8)
         checker.check_constants(status, rows)
-        for seal in self.layouts[longest].seals:
-            right = _have_valid_checksums(seal, rows, sizes, sums)
+        for checksum in self.layouts[longest].checksums:
+            right = _have_valid_checksums(checksum, rows, sizes, sums)
             status[~right & (status == VALID)] = CHECKSUM
         for index, check in enumerate(checker.checks):
             if isinstance(check, LookupCondition):
@@ -246,22 +256,22 @@ def _gather_rows(buffer: Bytes1D, offsets: Offsets, size: int) -> Bytes2D:
 
 
 def _have_valid_checksums(
-    seal: Seal, rows: Bytes2D, sizes: Offsets, sums: Sums | None
+    checksum: FrameChecksum, rows: Bytes2D, sizes: Offsets, sums: Sums | None
 ) -> NDArray[np.bool_]:
     """Return whether each candidate has the right checksum, (n,).
 
     Args:
-        seal: the checksum in the longest layout.
+        checksum: the checksum in the longest layout.
         rows: the candidates, in rows of the size of the longest layout.
     """
     # The bytes after the covered bytes, such as the stored checksum, move to the end of the row.
     # Zeros fill the gap. They do not change the result of the algorithms in `ZERO_EXTENDED`.
     size = rows.shape[1]
-    tail = size - seal.spans[-1][1]
+    tail = size - checksum.spans[-1][1]
     stops = sizes - tail
     moved = rows * (np.arange(size) < stops[:, None])
     if tail:
         moved[:, size - tail :] = gather_rows(
             rows.reshape(-1), np.arange(len(rows)) * size + stops, tail
         )
-    return seal.are_valid(moved, sums)
+    return checksum.are_valid(moved, sums)

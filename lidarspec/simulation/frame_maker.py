@@ -140,9 +140,9 @@ class FrameMaker:
 
     def frame(self, values: Values) -> bytes:
         """Return the bytes of one frame."""
-        return self.seal(self.table([values]))[0]
+        return self.make_frames(self.table([values]))[0]
 
-    def seal(self, table: CompiledTable) -> list[bytes]:
+    def make_frames(self, table: CompiledTable) -> list[bytes]:
         """Fill in constants and checksums; return the bytes of each frame as it is sent.
 
         If the frame type has a wire form (`Frame.wire`), the bytes are encoded in this form.
@@ -150,7 +150,7 @@ class FrameMaker:
         Raises:
             SpecError: if the wire form cannot encode a value.
         """
-        structs = seal_frames(table)
+        structs = complete_structs(table)
         if self._coder is None:
             return structs
         frames = list[bytes]()
@@ -314,7 +314,7 @@ class FrameMaker:
         for leaf in layout.leaves.values():
             if leaf.info.initial and all(leaf.info.path not in values for values, _ in frames):
                 leaf.store(rows, leaf.info.initial)
-        layout.seal(rows)
+        layout.complete_rows(rows)
         return rows
 
     def _get_raw(self, values: Values, path: str) -> int:
@@ -339,14 +339,14 @@ def set_nested(values: dict[str, Any], path: str, value: Any) -> None:
     values[name] = value
 
 
-def seal_frames(table: CompiledTable) -> list[bytes]:
+def complete_structs(table: CompiledTable) -> list[bytes]:
     """Fill in the constants and checksums of a table; return the bytes of each frame.
 
     The bytes are those of the struct, before a wire form encodes them.
     """
     frames = [b""] * len(table)
     for group in table.groups:
-        group.layout.seal(group.rows)
+        group.layout.complete_rows(group.rows)
         size = group.layout.size
         data = group.rows.tobytes()
         for row, index in enumerate(group.where.tolist()):

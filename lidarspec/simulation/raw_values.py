@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows
-from lidarspec.simulation.frame_maker import seal_frames
+from lidarspec.simulation.frame_maker import complete_structs
 from lidarspec.spec.tree import FieldInfo
 
 Floats = NDArray[np.float64]
@@ -39,7 +39,7 @@ class PartRows(CompiledTable):
 
     def put_back(self) -> None:
         """Write the parts with their checksums into the frames."""
-        left = iter(seal_frames(self))
+        left = iter(complete_structs(self))
         axis, kind = self.place
         destinations = list[tuple[int, int, NDArray[np.uint8]]]()
         for group, buffer, walked in self.frames.find_parts(axis):

@@ -857,7 +857,7 @@ class FrameSimulation:
         if timeline is not None and not timeline.is_perfect:
             since_ns = round(since * 1e9)
             self.clock.apply(table, timeline, since_ns + times)
-        return PacketBlock(self._maker.seal(table)[:count], times[: count + 1])
+        return PacketBlock(self._maker.make_frames(table)[:count], times[: count + 1])
 
     def _with_points(self, table: CompiledTable) -> CompiledTable:
         """Return a table whose rows have points: the frames, or the parts of the frames."""
@@ -930,7 +930,7 @@ class FramesWithoutPoints:
         table = self._fill(name, range(1), values)
         if not self._timeline.is_perfect and find_clock(self._sensor, name) is not None:
             self.find_clock(name).apply(table, self._timeline, np.array([round(now)]))
-        return self._get_maker(name).seal(table)[0]
+        return self._get_maker(name).make_frames(table)[0]
 
     def make_frame(self, name: str, number: int) -> bytes:
         """Return frame number `number` of a type."""
@@ -953,7 +953,7 @@ class FramesWithoutPoints:
             rate = self._sensor.frames[name].simulation.rate
             times = np.rint(np.array(numbers) * 1e9 / rate).astype(np.int64)
             self.find_clock(name).apply(table, self._timeline, times)
-        return self._get_maker(name).seal(table)
+        return self._get_maker(name).make_frames(table)
 
     def _fill(self, name: str, numbers: range, values: Mapping[str, Any]) -> CompiledTable:
         """Return frames with the values that the spec declares.

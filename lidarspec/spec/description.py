@@ -28,7 +28,7 @@ from lidarspec.spec.arguments import (
 from lidarspec.spec.results import Imu, Points
 from lidarspec.spec.syntax import check_struct, fixed_size, frame_tree, prepare
 from lidarspec.spec.timing import Clock
-from lidarspec.spec.tree import Node, Sealed, children
+from lidarspec.spec.tree import ChecksummedStruct, Node, children
 from lidarspec.spec.wire_forms import WireForm, check_wire_form
 
 #: An item that a sensor sends after a command; see `Simulation.answers`.
@@ -219,7 +219,7 @@ class Frame:
             kind = "out, "
         else:
             kind = ""
-        root = self.tree.struct if isinstance(self.tree, Sealed) else self.tree
+        root = self.tree.struct if isinstance(self.tree, ChecksummedStruct) else self.tree
         names = [member.name for member in children(root) if member.name]
         return (
             f"Frame({kind}{size or f'up to {self.max_length}'}"

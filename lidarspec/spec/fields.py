@@ -202,7 +202,7 @@ class SizeOf(layer.SizeField):
         super().__init__(subcon, tuple(filter(None, part.split("."))), plus)
 
 
-class Checksummed(layer.SealedStruct):
+class Checksummed(layer.ChecksummedBase):
     """A struct that contains its checksum, in any of its fields.
 
     It can be nested. A `Checksummed` around another `Checksummed` is a struct with two checksums.
@@ -376,7 +376,7 @@ class Checksummed(layer.SealedStruct):
         return start, end
 
 
-layer.SealedStruct.plugin_class = Checksummed
+layer.ChecksummedBase.plugin_class = Checksummed
 
 
 class Parts(layer.Partition):

@@ -4,20 +4,20 @@
 exports iterate over it (`children`, `nodes`) and do not use construct. A node describes how bytes
 are stored, and its `FieldInfo` describes their value.
 
-    Struct          a sequence of members
-    Sealed          a Struct with a checksum
-    Number          an integer or float of whole bytes
-    Blob            plain bytes; the name of an unnamed constant is ""
-    Block           bytes that contain one or more integers as bits (`BlockInteger`)
-    Repeat          an array: one element, repeated
-    PartSequence    frames within the frame, one after another, each with its own size
-    When            one of two nodes, by a condition
-    Select          one of several nodes, by a key
-    Empty           no bytes
-    Check           no bytes; a condition that the frame must meet
-    Never           an alternative that is always an error
-    Derived         no bytes; a value made from other bytes of the frame
-    Opaque          a part that only construct can read
+    Struct             a sequence of members
+    ChecksummedStruct  a Struct with a checksum
+    Number             an integer or float of whole bytes
+    Blob               plain bytes; the name of an unnamed constant is ""
+    Block              bytes that contain one or more integers as bits (`BlockInteger`)
+    Repeat             an array: one element, repeated
+    PartSequence       frames within the frame, one after another, each with its own size
+    When               one of two nodes, by a condition
+    Select             one of several nodes, by a key
+    Empty              no bytes
+    Check              no bytes; a condition that the frame must meet
+    Never              an alternative that is always an error
+    Derived            no bytes; a value made from other bytes of the frame
+    Opaque             a part that only construct can read
 
 Counts, lengths, conditions and keys are formulas, which consist of numbers, references to fields
 (`Ref`) and operations on both (`Op`). An expression that cannot be converted to a formula is
@@ -664,16 +664,16 @@ class Struct:
 
     @property
     def struct(self) -> Struct:
-        """The struct itself; the property exists because `Sealed` has it."""
+        """The struct itself, as for a `ChecksummedStruct`."""
         return self
 
 
 @dataclass(frozen=True, eq=False)
-class Sealed:
+class ChecksummedStruct:
     """A struct with a checksum.
 
     Attributes:
-        body: the struct, or a `Sealed` of the struct with another checksum.
+        body: the struct, or a `ChecksummedStruct` of the struct with another checksum.
         fields: the paths of the fields with the checksum, low bits first.
         over: the paths of the first and the last member that the checksum covers; None for all
             bytes of the body without the bytes of `fields`.
@@ -681,7 +681,7 @@ class Sealed:
         absent: the values of the checksum that mean that the sensor has computed no checksum.
     """
 
-    body: Struct | Sealed
+    body: Struct | ChecksummedStruct
     fields: tuple[str, ...]
     over: tuple[str, str] | None
     declared: Checksum | None
@@ -889,7 +889,7 @@ Node = (
     | Blob
     | Block
     | Struct
-    | Sealed
+    | ChecksummedStruct
     | Repeat
     | PartSequence
     | When
@@ -907,7 +907,7 @@ def children(node: Node) -> tuple[Node, ...]:
     match node:
         case Struct():
             return node.members
-        case Sealed():
+        case ChecksummedStruct():
             return (node.body,)
         case Repeat():
             return (node.element,)

@@ -49,7 +49,7 @@ def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
         return
     try:
         maker = FrameMaker(subject.sensor, name)
-        frames = maker.seal(maker.table([sweep(number) for number in FAR_PACKETS]))
+        frames = maker.make_frames(maker.table([sweep(number) for number in FAR_PACKETS]))
         packets = decode_frames(subject, name, frames, by_clock=False)
         readings = clock_ns(subject.sensor, packets.batch())
     except LidarSpecError:  # another property reports the failure

@@ -26,7 +26,7 @@ from lidarspec.spec import Clock, Frame, OnWrap, Sensor
 from lidarspec.spec.fields import factor, is_unit
 from lidarspec.spec.syntax import is_expression
 from lidarspec.spec.timing import DAY_S
-from lidarspec.spec.tree import NAME_IS_COMPARED, Sealed, Struct, infos, nodes
+from lidarspec.spec.tree import NAME_IS_COMPARED, ChecksummedStruct, Struct, infos, nodes
 from lidarspec.testing.findings import Finding
 from lidarspec.testing.geometry import find_field_of_node, find_source_nodes, trace_points
 from lidarspec.testing.sensor_under_test import SensorUnderTest
@@ -234,7 +234,7 @@ def _changes_nothing(sensor: Sensor, name: str, values: Iterable[Any]) -> bool:
 
 def _check_frame(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     engine = get_codec(frame)
-    if not isinstance(frame.tree, Struct | Sealed):
+    if not isinstance(frame.tree, Struct | ChecksummedStruct):
         yield "LS114", f"the frame must be a Struct, not a {type(frame.struct).__name__}", name
     if not engine.is_compiled:
         reason = getattr(engine, "reason", "the layout of the frame cannot be computed")
@@ -406,15 +406,20 @@ def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
     """Yield findings for fields that no checksum covers, in a frame with checksums."""
     reported: set[str] = set()
     for layout in layouts:
-        if not layout.seals:
+        if not layout.checksums:
             continue
         under = {
-            byte for seal in layout.seals for start, end in seal.spans for byte in range(start, end)
+            byte
+            for checksum in layout.checksums
+            for start, end in checksum.spans
+            for byte in range(start, end)
         }
-        sealing = {leaf.info.path for seal in layout.seals for leaf in seal.leaves}
+        checksum_paths = {
+            leaf.info.path for checksum in layout.checksums for leaf in checksum.leaves
+        }
         for path, leaf in layout.leaves.items():
             if (
-                path in sealing
+                path in checksum_paths
                 or leaf.info.const is not None
                 or leaf.info.is_enforced
                 or path in reported
@@ -473,7 +478,8 @@ def _check_strength(
     if frame.plausible is not None or frame.confirm > 1 or not layouts:
         return
     checked = [
-        sum(leaf.info.bits for seal in layout.seals for leaf in seal.leaves) for layout in layouts
+        sum(leaf.info.bits for checksum in layout.checksums for leaf in checksum.leaves)
+        for layout in layouts
     ]
     constant = [sum(mask.bit_count() for mask, _ in layout.known.values()) for layout in layouts]
     weakest = min(map(sum, zip(checked, constant, strict=True)))

@@ -117,7 +117,7 @@ def every_raw_value_survives(subject: SensorUnderTest, name: str) -> None:
     engine = get_codec(subject.sensor.frames[name])
     if engine.is_compiled:
         return
-    sealed = material.find_checksum_paths(subject.sensor, name, b"")
+    checksum_paths = material.find_checksum_paths(subject.sensor, name, b"")
     follows = {
         info.path
         for info in engine.schema.fields.values()
@@ -129,7 +129,7 @@ def every_raw_value_survives(subject: SensorUnderTest, name: str) -> None:
             again = subject.sensor.parse(subject.sensor.build(name, parsed), frame=name)
         except (WireError, UsageError):
             continue
-        _require_same_values(parsed, again, sealed | follows, name)
+        _require_same_values(parsed, again, checksum_paths | follows, name)
 
 
 def _iter_changed_examples(subject: SensorUnderTest, name: str) -> Iterator[bytes]:
@@ -148,11 +148,13 @@ def _iter_changed_examples(subject: SensorUnderTest, name: str) -> Iterator[byte
                 yield bytes(data)
 
 
-def _require_same_values(parsed: Any, again: Any, sealed: set[str], name: str) -> None:
+def _require_same_values(parsed: Any, again: Any, checksum_paths: set[str], name: str) -> None:
     for (path, before), (other, after) in zip(
         iter_leaves(parsed), iter_leaves(again), strict=False
     ):
-        is_number = isinstance(before, int | float) and re.sub(r"\[\d+\]", "", path) not in sealed
+        is_number = (
+            isinstance(before, int | float) and re.sub(r"\[\d+\]", "", path) not in checksum_paths
+        )
         if path == other and is_number and not are_equal(before, after):
             raise ViolationError(
                 "LS303" if is_rounded_down(before, after) else "LS302",
@@ -178,8 +180,8 @@ def wrong_rebuild_values_are_invalid(subject: SensorUnderTest, name: str) -> Non
         for leaf, step in ((leaf, step) for leaf in leaves for step in (1, -1)):
             rows = np.frombuffer(data, np.uint8).reshape(1, -1).copy()
             leaf.store(rows, leaf.read_scalar(data) + step)
-            for seal in layout.seals:
-                seal.fill(rows)
+            for checksum in layout.checksums:
+                checksum.fill(rows)
             other = rows.tobytes()
             path = f"{name}.{leaf.info.path}"
             if other != data and engine.survey(rows[0], np.zeros(1, np.intp)).status[0] == VALID:
@@ -224,7 +226,7 @@ def the_start_of_a_frame_may_be_content(subject: SensorUnderTest, name: str) -> 
     rows = np.repeat(np.frombuffer(struct, np.uint8)[None], len(offsets), axis=0)
     for row, offset in zip(rows, offsets, strict=True):
         row[offset : offset + len(start)] = start
-    layout.seal(rows)
+    layout.complete_rows(rows)
     is_valid = valid_mask(subject.sensor, name, layout, rows)
     for row, offset in zip(rows[is_valid], np.flatnonzero(is_valid).tolist(), strict=True):
         if not np.array_equal(row[offset : offset + len(start)], start):
@@ -410,14 +412,14 @@ def _check_edit(
     read = list(material.iter_integers(again))
     if len(read) != len(integers):
         return
-    sealed = material.find_checksum_paths(subject.sensor, name, built)
+    checksum_paths = material.find_checksum_paths(subject.sensor, name, built)
     for index in edits:
         (holder, key, path) = integers[index]
         (target, read_key, _) = read[index]
         wanted = holder[key]
         got = target[read_key]
         require(
-            got == wanted or path in sealed,
+            got == wanted or path in checksum_paths,
             "LS305",
             f"{wanted} was written, but {got} was read",
             f"{name}.{path}",
@@ -511,7 +513,7 @@ def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
         return
     source = subject.make_random(f"flipped bits of {name}")
     tried = passed = 0
-    sealed = False
+    has_checksum = False
     for seed in range(
         subject.limit_to_bytes(name, subject.scale_rounds(FLIPPED_FRAMES, MIN_FLIPPED_FRAMES))
     ):
@@ -519,18 +521,20 @@ def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
         layout = engine.tree.layout(data)
         assert isinstance(layout, Layout)
         row = np.frombuffer(data, np.uint8).reshape(1, -1)
-        if any(int(seal.load_stored(row)[0]) in seal.absent for seal in layout.seals):
+        if any(
+            int(checksum.load_stored(row)[0]) in checksum.absent for checksum in layout.checksums
+        ):
             continue
-        sealed = bool(layout.seals)
+        has_checksum = bool(layout.checksums)
         offsets = _choose_flipped_offsets(layout, len(data), source)
         passing = find_changes(subject.sensor.frames[name], data, ["flipped bit"], offsets=offsets)
         tried += 8 * len(offsets)
         passed += len(passing)
         covered = {
             byte
-            for seal in layout.seals
-            if not seal.absent
-            for start, end in seal.spans
+            for checksum in layout.checksums
+            if not checksum.absent
+            for start, end in checksum.spans
             for byte in range(start, end)
         }
         for _, byte, bit in passing:
@@ -545,7 +549,7 @@ def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
                 path,
             )
     if tried:
-        kind = "with a checksum" if sealed else "without a checksum"
+        kind = "with a checksum" if has_checksum else "without a checksum"
         subject.measured[f"{name}, {kind}: undetected single-bit errors"] = (
             f"{100 * passed / tried:.3g} %"
         )

@@ -107,7 +107,9 @@ def make_sweep(
             made.append(maker.frame(sweep(0)))
         packets = min(packets, max(total // len(made[0]), MIN_PACKETS))
         if len(made) < packets:
-            made += maker.seal(maker.table([sweep(number) for number in range(len(made), packets)]))
+            made += maker.make_frames(
+                maker.table([sweep(number) for number in range(len(made), packets)])
+            )
     except LidarSpecError:
         return []
     return made[:packets]

@@ -15,7 +15,7 @@ from typing import Any
 from lidarspec.framing.example_frames import random_frame
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.spec import Frame, Sensor
-from lidarspec.spec.tree import FieldInfo, Sealed, nodes
+from lidarspec.spec.tree import ChecksummedStruct, FieldInfo, nodes
 
 #: Maximum length in bytes of a short frame, which is cut at every byte.
 MAX_SHORT_BYTES = 300
@@ -130,12 +130,14 @@ def find_checksum_paths(sensor: Sensor, name: str, data: bytes) -> set[str]:
         return {
             path
             for node in nodes(sensor.frames[name].tree)
-            if isinstance(node, Sealed)
+            if isinstance(node, ChecksummedStruct)
             for path in node.fields
         }
     layout_or_refusal = layout.layout(data)
     return {
-        leaf.info.path for seal in getattr(layout_or_refusal, "seals", ()) for leaf in seal.leaves
+        leaf.info.path
+        for checksum in getattr(layout_or_refusal, "checksums", ())
+        for leaf in checksum.leaves
     }
 
 

@@ -64,8 +64,8 @@ class LayoutRanges:
         self._base = base.reshape(1, -1)
         self.layout = layout
         decided = {*header, *(leaf.info.path for leaf, _ in layout.following)}
-        for seal in layout.seals:
-            decided.update(leaf.info.path for leaf in seal.leaves)
+        for checksum in layout.checksums:
+            decided.update(leaf.info.path for leaf in checksum.leaves)
         self.free = [
             leaf
             for path, leaf in layout.leaves.items()
@@ -230,7 +230,7 @@ class LayoutRanges:
                 self.layout.leaves[path].store(rows[index : index + 1], raw)
         for path, number in self._header.items():
             self.layout.leaves[path].store(rows, number)
-        self.layout.seal(rows)
+        self.layout.complete_rows(rows)
         return rows
 
     def _check_rows(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -306,7 +306,7 @@ def find_ranges(
             leaf.store(rows, leaf.info.initial)
     for path, value in header:
         layout.leaves[path].store(rows, value)
-    layout.seal(rows)
+    layout.complete_rows(rows)
     if _are_valid(sensor, frame, layout, rows)[0]:
         return LayoutRanges(sensor, frame, layout, values, rows[0])
     fixed = {path: functools.partial(return_raw, value) for path, value in header}

@@ -33,7 +33,7 @@ from lidarspec.drafting.samples import ChecksumMatch, ChecksumPlace
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.frames.layout import Layout
 from lidarspec.framing.frame_engine import CompiledCodec, get_codec
-from lidarspec.spec.tree import FieldInfo, Sealed, nodes
+from lidarspec.spec.tree import ChecksummedStruct, FieldInfo, nodes
 from lidarspec.testing.commands import an_exchange_holds
 from lidarspec.testing.findings import ViolationError, require
 from lidarspec.testing.frames import iter_leaves
@@ -184,7 +184,7 @@ def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None
         for path in (*vector.get("values", {}), *vector.get("units", {})):
             plain = re.sub(r"\[\d+\]", "", path)
             pinned[plain] = pinned.get(plain, False) or bool(read_as.get(path))
-    sealing = _find_verified_fields(subject, name)
+    verified_paths = _find_verified_fields(subject, name)
     free = [
         path
         for path, info in subject.fields(name).items()
@@ -193,7 +193,7 @@ def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None
     required = [
         path
         for path in free
-        if path not in sealing and not SPARE_NAMES.search(path.rpartition(".")[2])
+        if path not in verified_paths and not SPARE_NAMES.search(path.rpartition(".")[2])
     ]
     problems = {"no vector states a value of": [path for path in required if path not in pinned]}
     problems["all vectors have 0 for"] = [path for path in required if pinned.get(path) is False]
@@ -248,11 +248,11 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
 
 def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
     """Check that each checksum is verified by a `Checksummed`."""
-    sealing = _find_verified_fields(subject, name)
+    verified_paths = _find_verified_fields(subject, name)
     free = [
         path
         for path, info in subject.fields(name).items()
-        if info.const is None and path not in sealing
+        if info.const is None and path not in verified_paths
     ]
     fields = subject.fields(name)
     named = [path for path in free if CHECKSUM_NAMES.fullmatch(fields[path].name)]
@@ -266,7 +266,7 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
         frames = []
     # The offset of a checksum belongs to a field only in a compiled frame.
     is_told = isinstance(get_codec(subject.sensor.frames[name]), CompiledCodec)
-    for match in _find_common_matches(frames) if is_told and not sealing else []:
+    for match in _find_common_matches(frames) if is_told and not verified_paths else []:
         path = _find_checksum_field(subject, name, match, frames[0])
         if path in (named or free) and (named or match.evidence_bits >= PROOF_BITS):
             fits = f"{_describe_match(match, len(frames[0]))} matches every vector"
@@ -284,7 +284,9 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
 
 def _find_verified_fields(subject: SensorUnderTest, name: str) -> set[str]:
     """Return the fields of a frame type that store a verified checksum."""
-    if not any(isinstance(node, Sealed) for node in nodes(subject.sensor.frames[name].tree)):
+    if not any(
+        isinstance(node, ChecksummedStruct) for node in nodes(subject.sensor.frames[name].tree)
+    ):
         return set()
     return set().union(
         *(

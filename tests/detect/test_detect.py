@@ -334,10 +334,10 @@ def test_frames_with_only_wrong_checksums_are_reported(tmp_path: Path) -> None:
         detect(path)
     assert error.value.__notes__ == [f"next: lidarspec crc {path}"]
     noise = random.Random(2)
-    sealed_by_chance = [frame[:46] + noise.randbytes(1) for frame in firmware_bug(60)]
+    right_by_chance = [frame[:46] + noise.randbytes(1) for frame in firmware_bug(60)]
     assert (
         "no other checksum algorithm was found"
-        in identify_sample(SampleBytes("", (b"".join(sealed_by_chance[:12]),))).fault
+        in identify_sample(SampleBytes("", (b"".join(right_by_chance[:12]),))).fault
     )
 
 
@@ -550,10 +550,10 @@ class TestStructure:
 
     @pytest.mark.parametrize(("size", "number"), [(60, 40), (600, 8)])
     def test_a_quick_search_finds_a_usual_crc(self, size: int, number: int) -> None:
-        sealed = SampleFrames(
+        checksummed = SampleFrames(
             body + zlib.crc32(body).to_bytes(4, "little") for body in make_bodies(size, number)
         )
-        assert next(iter_crc_matches(sealed, quick=True)).name == "CRC-32"
+        assert next(iter_crc_matches(checksummed, quick=True)).name == "CRC-32"
 
     @pytest.mark.slow
     def test_frames_of_one_length(self) -> None:

@@ -28,7 +28,7 @@ from lidarspec.spec.checksums import CRCS, name_of
 HEAD = b"\xaa\x55"
 
 
-def make_sealed_frames(
+def make_frames_with_checksum(
     checksum: Checksum,
     number: int = 12,
     length: int = 30,
@@ -65,7 +65,9 @@ def assert_found_by_name(
 ) -> None:
     crc = CRCS[name]
     match = find(
-        make_sealed_frames(crc, length=length, order="big" if len(name) % 2 else "little", vary=3)
+        make_frames_with_checksum(
+            crc, length=length, order="big" if len(name) % 2 else "little", vary=3
+        )
     )
     assert (match.algorithm, match.name, match.place) == (
         crc,
@@ -123,7 +125,7 @@ def test_a_crc_that_no_catalogue_knows(width: int, *, reflected: bool) -> None:
     poly, init, xorout = (source.getrandbits(width) | 1 for _ in range(3))
     crc = Crc(width, poly, init, reflected, reflected, xorout)
     assert name_of(crc) == ""
-    frames = make_sealed_frames(crc, 24, 25, vary=5)
+    frames = make_frames_with_checksum(crc, 24, 25, vary=5)
     match = found_among_crcs(frames)
     assert isinstance(match.algorithm, Crc)
     assert (match.algorithm.poly, match.algorithm.refin, match.right) == (poly, reflected, 24)
@@ -137,7 +139,7 @@ def test_a_crc_that_no_catalogue_knows(width: int, *, reflected: bool) -> None:
 @pytest.mark.slow
 def test_init_and_xorout_are_undetermined_for_frames_of_one_length() -> None:
     crc = Crc(16, 0x755B, 0x1234, xorout=0x4321)
-    frames = make_sealed_frames(crc)
+    frames = make_frames_with_checksum(crc)
     match = find_best(frames)
     assert isinstance(match.algorithm, Crc)
     assert match.algorithm.poly == crc.poly
@@ -148,7 +150,7 @@ def test_init_and_xorout_are_undetermined_for_frames_of_one_length() -> None:
 
 @pytest.mark.slow
 def test_a_checksum_that_skips_the_first_bytes() -> None:
-    match = find_best(make_sealed_frames(CRCS["CRC-16/MODBUS"], skip=2))
+    match = find_best(make_frames_with_checksum(CRCS["CRC-16/MODBUS"], skip=2))
     assert (match.name, match.span.head, match.span.describe(match.place, 34)) == (
         "CRC-16/MODBUS",
         2,
@@ -173,7 +175,9 @@ def test_a_checksum_that_skips_the_first_bytes() -> None:
     ids=lambda checksum: checksum.describe(),
 )
 def test_plain_checksums(checksum: Checksum) -> None:
-    frames = make_sealed_frames(checksum, length=27 if not isinstance(checksum, WordXor) else 28)
+    frames = make_frames_with_checksum(
+        checksum, length=27 if not isinstance(checksum, WordXor) else 28
+    )
     at_end = [match for match in search(frames) if match.place.offset == -match.place.size]
     assert checksum in [match.algorithm for match in at_end]
     assert at_end[0].right == 12
@@ -194,7 +198,7 @@ def test_plain_checksums(checksum: Checksum) -> None:
     ],
 )
 def test_the_printed_python_computes_the_same_checksum(checksum: Checksum) -> None:
-    frames = make_sealed_frames(checksum, 40, 27)
+    frames = make_frames_with_checksum(checksum, 40, 27)
     match = find_best(frames)
     scope: dict[str, Any] = vars(lidarspec) | {
         name: getattr(lidarspec.spec, name) for name in ("Checksum", "Xor", "WordXor")
@@ -219,7 +223,7 @@ def test_grouped_words_around_a_field(number: int) -> None:
 
 @pytest.mark.slow
 def test_an_xor_with_a_constant_is_found_and_its_place_a_guess() -> None:
-    frames = make_sealed_frames(ChecksumWithConstant(Xor(), 0x33), 40, 27)
+    frames = make_frames_with_checksum(ChecksumWithConstant(Xor(), 0x33), 40, 27)
     matches = search(frames)
     assert {match.algorithm for match in matches} == {ChecksumWithConstant(Xor(), 0x33)}
     assert ChecksumPlace(-1, 1) in [match.place for match in matches]
@@ -256,7 +260,7 @@ def test_an_xor_in_two_nibbles() -> None:
 
 @pytest.mark.slow
 def test_damaged_frames_do_not_hide_it() -> None:
-    frames = make_sealed_frames(Crc(8, 0x4D), 60, 44)
+    frames = make_frames_with_checksum(Crc(8, 0x4D), 60, 44)
     damaged = [
         bytes([*frame[:9], frame[9] ^ 0x40, *frame[10:]]) if index % 5 == 0 else frame
         for index, frame in enumerate(frames)

@@ -257,7 +257,7 @@ def make_frames(
     )  # type: ignore[arg-type]
 
 
-SEALED = [
+CHECKSUMMED = [
     (Crc(16, 0x8005, init=0xFFFF, refin=True, refout=True), 0, "little"),
     (Xor(), 2, "little"),
     (Sum(16), 0, "big"),
@@ -270,9 +270,9 @@ SEALED = [
 @pytest.mark.parametrize(
     ("checksum", "skip", "order", "vary"),
     [
-        (*SEALED[0], 0),
-        *(pytest.param(*one, 0, marks=pytest.mark.slow) for one in SEALED[1:]),
-        *(pytest.param(*one, 3, marks=pytest.mark.slow) for one in SEALED[:3]),
+        (*CHECKSUMMED[0], 0),
+        *(pytest.param(*one, 0, marks=pytest.mark.slow) for one in CHECKSUMMED[1:]),
+        *(pytest.param(*one, 3, marks=pytest.mark.slow) for one in CHECKSUMMED[:3]),
     ],
     ids=lambda value: value.describe() if isinstance(value, Checksum) else str(value),
 )

@@ -124,7 +124,7 @@ NUMBERS = Struct(
 )
 
 
-def make_sealed_struct(number: int, algorithm: Any, field: Any) -> Checksummed:
+def make_checksummed_struct(number: int, algorithm: Any, field: Any) -> Checksummed:
     """Return a struct with a checksum in the middle."""
     body = Struct(
         "magic" / Const(bytes([0xF1, number])),
@@ -180,7 +180,7 @@ SENSOR = Sensor(
         "kinds": Frame(KINDS, max_length=20),
         "numbers": Frame(NUMBERS, max_length=70),
         **{
-            f"sealed{number}": Frame(make_sealed_struct(number, *pair), max_length=110)
+            f"checksummed{number}": Frame(make_checksummed_struct(number, *pair), max_length=110)
             for number, pair in enumerate(ALGORITHMS)
         },
     },

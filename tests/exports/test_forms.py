@@ -66,8 +66,8 @@ def test_json_has_text_frames_with_their_wire_form() -> None:
 
 def test_json_has_the_algorithm_inside_another_one() -> None:
     body = Struct("count" / Int8ub, "sum" / Int16ub)
-    sealed = Checksummed(body, field="sum", algorithm=ZeroPadded(WordXor(1, (1, 2)), 8))
-    layout = node_data(Frame(sealed).tree)
+    checksummed = Checksummed(body, field="sum", algorithm=ZeroPadded(WordXor(1, (1, 2)), 8))
+    layout = node_data(Frame(checksummed).tree)
     algorithm = layout["checksum"]["algorithm"]
     assert (algorithm["kind"], algorithm["to"]) == ("ZeroPadded", 8)
     inner = algorithm["algorithm"]

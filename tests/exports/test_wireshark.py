@@ -239,13 +239,13 @@ def test_physical_values_are_fields_too(tmp_path: Path) -> None:
 )
 def test_a_wrong_checksum_is_marked(name: str, tmp_path: Path) -> None:
     sensor = SHAPED.get(name) or lidarspec.sensor(name)
-    sealed = [
+    checksummed = [
         kind
         for kind in sensor.incoming
         if material.find_checksum_paths(sensor, kind, sensor.example(kind))
     ]
     frames = []
-    for kind in sealed:
+    for kind in checksummed:
         good = sensor.example(kind, seed=3)
         place = next(
             spot
@@ -265,7 +265,7 @@ def test_a_wrong_checksum_is_marked(name: str, tmp_path: Path) -> None:
             [f"{prefix}.frame", f"{prefix}.checksum.status", f"{prefix}.checksum.bad"],
         )
     )
-    assert [kind for kind, _, _ in rows] == [[kind] for kind in sealed for _ in range(2)]
+    assert [kind for kind, _, _ in rows] == [[kind] for kind in checksummed for _ in range(2)]
     for number, (_, status, bad) in enumerate(rows):
         assert ("0" in status) == bool(bad) == bool(number % 2), f"packet {number + 1}"
 

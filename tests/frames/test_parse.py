@@ -148,7 +148,7 @@ def test_arrays_of_all_kinds(name: str) -> None:
     layout = layouts.layout(bytes(size))
     assert isinstance(layout, Layout)
     rows = np.frombuffer(random.Random(name).randbytes(3 * size), np.uint8).reshape(3, size).copy()
-    layout.seal(rows)
+    layout.complete_rows(rows)
     for data in map(np.ndarray.tobytes, rows):
         found = unpack_by_layout(frame, data)
         assert found is not None
@@ -230,8 +230,8 @@ class Failing(Checksum):
 
 
 def test_a_checksum_that_raises_is_the_plugins_fault() -> None:
-    sealed = Checksummed(Struct("x" / Int8ub, "sum" / Int8ub), "sum", Failing())
-    sensor = against_construct.sensor(sealed)
+    checksummed = Checksummed(Struct("x" / Int8ub, "sum" / Int8ub), "sum", Failing())
+    sensor = against_construct.sensor(checksummed)
     for use in (lambda: sensor.parse(b"\1\2"), lambda: sensor.build("data", x=1)):
         with pytest.raises(SpecError, match="ZeroDivisionError") as error:
             use()

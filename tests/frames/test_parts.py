@@ -176,12 +176,14 @@ def test_a_part_is_built_as_the_kind_with_no_further_fields() -> None:
 
 
 FOUR = Struct("kind" / Const(4, Int8ub), "value" / Int16ub)
-SEALED = Checksummed(
+CHECKSUMMED = Checksummed(
     Struct("kind" / Const(5, Int8ub), "value" / Int8ub, "sum" / Int8ub),
     field="sum",
     algorithm=Xor(),
 )
-COUNTED = Struct("count" / Int8ub, "parts" / Parts({"four": FOUR, "sealed": SEALED}, this.count))
+COUNTED = Struct(
+    "count" / Int8ub, "parts" / Parts({"four": FOUR, "checksummed": CHECKSUMMED}, this.count)
+)
 LINK = Struct("next" / Int8ub, "x" / Bytes(this.next % 3))
 CHAIN = Struct(
     "first" / Int8ub, "parts" / Parts(LINK, size=this.first, following=this.next), "end" / Int8ub

@@ -86,7 +86,7 @@ MEASURED: dict[str, tuple[list[Any], dict[str, Any], str, dict[str, Any]]] = {
         "04000102 04000304",
         {},
     ),
-    "under a seal": (
+    "under a checksum": (
         [
             "v"
             / Checksummed(

@@ -139,7 +139,9 @@ def test_checksums_are_computed_for_all_lengths_at_once() -> None:
     for layouts in (variable_lengths.MANY_LAYOUTS, NEVER):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(variable_lengths, "MANY_LAYOUTS", layouts)
-            decoder = Decoder(sensor, stream=True, sums=lambda seal, rows: seal.load_stored(rows))
+            decoder = Decoder(
+                sensor, stream=True, sums=lambda checksum, rows: checksum.load_stored(rows)
+            )
             frames = decoder.feed(data) + decoder.finish()
             found.append(([(item.offset, item.data) for item in frames], str(decoder.stats)))
     assert found[0] == found[1]

@@ -229,8 +229,8 @@ def _frame(sensor: Sensor, name: str) -> Target:
         if found is None:
             return data
         rows = np.frombuffer(data[: found.size], np.uint8).reshape(1, -1).copy()
-        for seal in found.seals:
-            seal.fill(rows)
+        for checksum in found.checksums:
+            checksum.fill(rows)
         return rows.tobytes() + data[found.size :]
 
     def made() -> list[bytes]:

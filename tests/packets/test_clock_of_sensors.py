@@ -102,7 +102,7 @@ class SimulatedClock:
         if status is not None and not status.frame:
             states = timeline.lock_states(times)
             StatusWriter(sensor, first, writer.read).write(table, states, self.faults.follows)
-        return FrameMaker(sensor, name).seal(table)
+        return FrameMaker(sensor, name).make_frames(table)
 
     def _make_status(self, times: np.ndarray) -> list[bytes]:
         """Return the frames of another type that report the state of the clock."""
@@ -119,7 +119,7 @@ class SimulatedClock:
         table = repeat_frame(sensor, status.frame, example, len(times))
         states = ClockTimeline(self.faults).lock_states(times)
         StatusWriter(sensor, first).write(table, states, self.faults.follows)
-        return FrameMaker(sensor, status.frame).seal(table)
+        return FrameMaker(sensor, status.frame).make_frames(table)
 
 
 def repeat_frame(sensor: ls.Sensor, name: str, data: bytes, count: int) -> CompiledTable:

@@ -21,7 +21,7 @@ from construct import Bytes, Int8ub, Struct, this
 import lidarspec
 from lidarspec import Packets, Sensor, UsageError, simulate
 from lidarspec.frames.frame_table import CompiledTable
-from lidarspec.frames.layout import Seal
+from lidarspec.frames.layout import FrameChecksum
 from lidarspec.frames.row_checksums import compute_checksums
 from lidarspec.points import backends
 from lidarspec.points.evaluate import evaluate
@@ -313,8 +313,8 @@ def test_compiled_checksums_are_those_of_the_algorithm(
     rows = np.random.default_rng(1).integers(
         0, 256, (kernelsums.MIN_FRAMES_SEEN, 50), dtype=np.uint8
     )
-    seal = Seal((), spans, algorithm, ())
-    found = kernelsums.checksums(seal, rows)
+    checksum = FrameChecksum((), spans, algorithm, ())
+    found = kernelsums.checksums(checksum, rows)
     assert found is not None
     covered = np.concatenate([rows[:, start:stop] for start, stop in spans], axis=1)
     np.testing.assert_array_equal(found, compute_checksums(algorithm, covered), strict=True)
@@ -325,7 +325,7 @@ def test_compiled_checksums_are_those_of_the_algorithm(
 def test_crcs_over_long_rows_are_those_of_the_algorithm(algorithm: Crc) -> None:
     rows = np.random.default_rng(1).integers(0, 256, (19, 2000), dtype=np.uint8)
     spans = ((1, 1003), (1005, 1998))
-    found = kernelsums.checksums(Seal((), spans, algorithm, ()), rows)
+    found = kernelsums.checksums(FrameChecksum((), spans, algorithm, ()), rows)
     assert found is not None
     covered = np.concatenate([rows[:, start:stop] for start, stop in spans], axis=1)
     assert found.tolist() == [algorithm(row.tobytes()) for row in covered]
@@ -336,7 +336,7 @@ def test_checksums_are_compiled_for_the_decoder_that_asks_and_no_other(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[int] = []
-    monkeypatch.setattr(kernelsums, "checksums", lambda seal, rows: asked.append(len(rows)))
+    monkeypatch.setattr(kernelsums, "checksums", lambda checksum, rows: asked.append(len(rows)))
     for name in ("ldrobot-stl27l", "shape-count"):
         data = b"".join(frames_of(name))
         compiled, plain = (sensor_of(name).decoder(backend=backend) for backend in ("jit", "numpy"))

@@ -213,7 +213,7 @@ def test_checksums_are_at_their_declared_positions() -> None:
 @pytest.mark.parametrize(
     "name", ["shape-middle", "shape-nibbles", "shape-nested", "shape-twice", "shape-sized"]
 )
-def test_a_sealed_struct_parses_and_builds_without_a_sensor(name: str) -> None:
+def test_a_checksummed_struct_parses_and_builds_without_a_sensor(name: str) -> None:
     """An author tries the struct first, without a sensor."""
     sensor = SHAPES[name]
     struct, frame = sensor.frames["data"].struct, sensor.example("data")

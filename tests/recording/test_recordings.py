@@ -209,12 +209,12 @@ def test_hostile_files_cost_neither_memory_nor_exceptions(path: Path, *, salvage
     header = MAGIC + pack_record(HEADER, b"{}")
     claims = _HEAD.pack(b"\xb5LS\x1e", 1, 0, 255, 65535, 0)
     # The address is longer than its field.
-    sealed = _HEAD.pack(b"\xb5LS\x1e", 1, 0, 4, 0, 0) + b"\x09\x00\x00\x00"
-    sealed += zlib.crc32(sealed).to_bytes(4, "little")
+    checksummed = _HEAD.pack(b"\xb5LS\x1e", 1, 0, 4, 0, 0) + b"\x09\x00\x00\x00"
+    checksummed += zlib.crc32(checksummed).to_bytes(4, "little")
     for tail in (
         claims,
         claims * 300,
-        sealed * 3,
+        checksummed * 3,
         MAGIC,
         source.randbytes(100_000),
         b"\xb5" * 1000,

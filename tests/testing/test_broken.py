@@ -77,7 +77,7 @@ DECLARED = {
     "common_sync": {"LS204"},
     "uncovered_field": {"LS205"},
     "no_plausible": {"LS206"},
-    "unsealed": {"LS212"},
+    "checksum_not_verified": {"LS212"},
     "untraceable": {"LS208"},
     "acknowledges_nothing": {"LS209"},
     "out_of_reach": {"LS210"},

@@ -581,15 +581,17 @@ def test_a_checksum_of_another_name_is_found_in_the_vectors(samples: int) -> Non
         "header" / Const(b"\xaa\x55\xc3"), "samples" / Array(samples, Int16ul), "end" / Int16ul
     )
     plain = Frame(struct, data=True, max_length=5 + 2 * samples)
-    sealed = replace(plain, struct=Checksummed(struct, field="end", algorithm=Crc(16, 0x8005)))
-    examples = [sound.sensor(sealed).example("data", seed=seed) for seed in range(3)]
+    checksummed = replace(plain, struct=Checksummed(struct, field="end", algorithm=Crc(16, 0x8005)))
+    examples = [sound.sensor(checksummed).example("data", seed=seed) for seed in range(3)]
     vectors = [{"frame": "data", "hex": data.hex(), "source": "made up"} for data in examples]
     said = (
         "LS212 data.end: Crc(width=16, poly=0x8005) over all other bytes,"
         " stored little-endian, matches every vector"
     )
     assert list_lacking(sound.sensor(plain), vectors)[0].startswith(said)
-    assert not any(text.startswith("LS212") for text in list_lacking(sound.sensor(sealed), vectors))
+    assert not any(
+        text.startswith("LS212") for text in list_lacking(sound.sensor(checksummed), vectors)
+    )
 
 
 def test_an_invalid_vector_does_not_hide_others() -> None:

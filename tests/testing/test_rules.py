@@ -85,8 +85,8 @@ def test_a_weak_frame_without_points_may_have_three_bytes_to_be_known_by() -> No
 def test_a_checksum_may_begin_behind_the_header() -> None:
     def covering(*names: str) -> set[str]:
         struct = sound.struct()
-        sealed = Checksummed(struct, field="sum", algorithm=Sum(16), over=names)
-        return declared_codes(sound.sensor(sound.frame(sealed)))
+        checksummed = Checksummed(struct, field="sum", algorithm=Sum(16), over=names)
+        return declared_codes(sound.sensor(sound.frame(checksummed)))
 
     behind = ("time", "tilt", "first", "last", "count", "samples")
     assert covering(*behind) == set()

@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.frames.layout import Bytes2D, Seal, Sums
+from lidarspec.frames.layout import Bytes2D, FrameChecksum, Sums
 from lidarspec.frames.row_checksums import compute_checksums, finalize, make_place_tables
 from lidarspec.points.numba_kernels.kernels import compile_source, import_numba
 from lidarspec.points.numba_kernels.source import HEAD
@@ -133,13 +133,13 @@ class _ByteShares:
     The share of a byte is the change of the checksum that this byte causes.
     """
 
-    def __init__(self, seal: Seal) -> None:
+    def __init__(self, checksum: FrameChecksum) -> None:
         self.seen = 0
-        self._seal = seal
-        self._places = np.concatenate([np.arange(*span, dtype=np.int64) for span in seal.spans])
+        self._checksum = checksum
+        self._places = np.concatenate([np.arange(*span, dtype=np.int64) for span in checksum.spans])
         self.is_suited = (
-            isinstance(seal.algorithm, Crc | Xor | WordXor)
-            and seal.algorithm.width <= 16
+            isinstance(checksum.algorithm, Crc | Xor | WordXor)
+            and checksum.algorithm.width <= 16
             and len(self._places) <= MAX_TABLE_BYTES
         )
         self.start = 0
@@ -154,7 +154,7 @@ class _ByteShares:
         places = self._places.tolist()
         rows = np.zeros((len(places), 256, len(places)), np.uint8)
         rows[np.arange(len(places)), :, np.arange(len(places))] = np.arange(256)
-        values = compute_checksums(self._seal.algorithm, rows.reshape(-1, len(places))).astype(
+        values = compute_checksums(self._checksum.algorithm, rows.reshape(-1, len(places))).astype(
             np.uint16
         )
         shares = dict(zip(places, (values ^ values[0]).reshape(-1, 256), strict=True))
@@ -192,31 +192,31 @@ class _ByteShares:
         return checksums.view(np.uint64)
 
 
-_SHARES_BY_SEAL: WeakKeyDictionary[Seal, _ByteShares] = WeakKeyDictionary()
+_SHARES_BY_CHECKSUM: WeakKeyDictionary[FrameChecksum, _ByteShares] = WeakKeyDictionary()
 
 
-def checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64] | None:
+def checksums(checksum: FrameChecksum, rows: Bytes2D) -> NDArray[np.uint64] | None:
     """Return the checksums of frames, (n,).
 
     Returns None if a kernel cannot compute the checksums faster than NumPy.
 
     Args:
-        seal: the checksum of the frame type.
+        checksum: the checksum of the frame type.
         rows: the frames, (n, size).
     """
-    shares = _SHARES_BY_SEAL.get(seal)
-    if shares is None and not seal.spans:
+    shares = _SHARES_BY_CHECKSUM.get(checksum)
+    if shares is None and not checksum.spans:
         return None  # over no bytes there is nothing to compute
-    algorithm = seal.algorithm
-    length = sum(stop - start for start, stop in seal.spans)
+    algorithm = checksum.algorithm
+    length = sum(stop - start for start, stop in checksum.spans)
     if isinstance(algorithm, Crc) and (
         algorithm.width > 16 or (algorithm.width > 8 and length > MAX_TABLE_BYTES)
     ):
         if not rows.flags.c_contiguous or rows.size < MIN_ROW_BATCH_BYTES:
             return None
-        return _compute_along_rows(algorithm, seal.spans, rows)
+        return _compute_along_rows(algorithm, checksum.spans, rows)
     if shares is None:
-        shares = _SHARES_BY_SEAL[seal] = _ByteShares(seal)
+        shares = _SHARES_BY_CHECKSUM[checksum] = _ByteShares(checksum)
     shares.seen += len(rows)
     if (
         not shares.is_suited

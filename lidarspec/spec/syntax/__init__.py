@@ -20,13 +20,13 @@ from lidarspec.spec.syntax.meaning import (
 )
 from lidarspec.spec.syntax.refusals import check_struct as check_struct
 from lidarspec.spec.syntax.replacements import (
+    ChecksummedBase as ChecksummedBase,
     DescribedField as DescribedField,
     Fault as Fault,
     MeasuredStruct as MeasuredStruct,
     MismatchError as MismatchError,
     ParsedParts as ParsedParts,
     Partition as Partition,
-    SealedStruct as SealedStruct,
     SizeField as SizeField,
     WireNaN as WireNaN,
     check_bound as check_bound,
@@ -40,8 +40,8 @@ from lidarspec.spec.syntax.structs import (
     has_member as has_member,
     is_expression as is_expression,
     is_struct as is_struct,
+    iter_checksummed as iter_checksummed,
     iter_leaves as iter_leaves,
-    iter_seals as iter_seals,
     prepare as prepare,
     random_value as random_value,
     to_public as to_public,

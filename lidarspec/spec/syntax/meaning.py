@@ -44,6 +44,7 @@ from lidarspec.spec.syntax.adapters import (
 )
 from lidarspec.spec.syntax.replacements import (
     BoundedPart,
+    ChecksummedBase,
     CountField,
     DescribedField,
     LimitedNumber,
@@ -51,7 +52,6 @@ from lidarspec.spec.syntax.replacements import (
     Partition,
     RawPart,
     Reserved,
-    SealedStruct,
     SizeField,
 )
 from lidarspec.spec.syntax.structs import (
@@ -191,8 +191,8 @@ class _Builder:
             return self._make_block(inner, place)
         if is_block:
             return self.node(inner.subcon, place)
-        if isinstance(inner, SealedStruct):
-            return self._make_sealed(inner, place)
+        if isinstance(inner, ChecksummedBase):
+            return self._make_checksummed(inner, place)
         if isinstance(inner, Struct):
             return self._make_struct(inner, place)
         if isinstance(inner, Array):
@@ -652,7 +652,7 @@ class _Builder:
             until: the predicate of construct's RepeatUntil, or None.
         """
         info = place.info
-        is_struct = isinstance(element, tree.Struct | tree.Sealed)
+        is_struct = isinstance(element, tree.Struct | tree.ChecksummedStruct)
         if until is not None and not callable(until):
             return None  # construct reads one element, or elements without an end
         rules = [rule for rule in (count, within, until) if rule is not None]
@@ -751,9 +751,9 @@ class _Builder:
             f"{reason.partition(': ')[2]}: use plausible=lambda f: ..., which is vectorized",
         )
 
-    def _make_sealed(self, con: SealedStruct, place: _Context) -> tree.Node:
+    def _make_checksummed(self, con: ChecksummedBase, place: _Context) -> tree.Node:
         body = self.node(con.subcon, place)
-        if not isinstance(body, tree.Struct | tree.Sealed):
+        if not isinstance(body, tree.Struct | tree.ChecksummedStruct):
             return tree.Opaque(
                 place.name,
                 place.info,
@@ -766,7 +766,7 @@ class _Builder:
             over = (prefix + con.over[0], prefix + con.over[-1])
         else:
             over = None
-        return tree.Sealed(
+        return tree.ChecksummedStruct(
             body,
             tuple(prefix + name for name in con.fields),
             over,
@@ -918,7 +918,7 @@ def _is_always_defined(formula: tree.Formula) -> bool:
 def _differ_in_layout(element: tree.Node, axis: str) -> bool:
     """Return whether the elements of an array have checksums, or different layouts."""
     return any(
-        isinstance(node, tree.Sealed)
+        isinstance(node, tree.ChecksummedStruct)
         or (isinstance(node, tree.Blob) and node.ending is not None)
         or any(
             axis in ref.info.axes for formula in tree.formulas(node) for ref in tree.refs(formula)
@@ -1008,7 +1008,7 @@ def _find_min_size(node: tree.Node) -> int:
             options = [*(case for _, case in node.cases), node.default]
             sizes = [_find_min_size(case) for case in options if not isinstance(case, tree.Never)]
             return min(sizes, default=0)
-        case tree.Struct() | tree.Sealed():
+        case tree.Struct() | tree.ChecksummedStruct():
             return sum(map(_find_min_size, tree.children(node)))
         case tree.Repeat():
             return node.count * _find_min_size(node.element) if isinstance(node.count, int) else 0
@@ -1037,7 +1037,7 @@ def _find_below(node: tree.Node, names: Iterable[str]) -> tree.Node:
         SpecError: if the path does not exist.
     """
     for name in names:
-        body = node.struct if isinstance(node, tree.Sealed) else node
+        body = node.struct if isinstance(node, tree.ChecksummedStruct) else node
         if isinstance(body, tree.Struct):
             found = [member for member in body.members if member.name == name]
         else:

@@ -4,9 +4,6 @@ A struct with ``"body" / RawCopy(...), "crc" / Checksum(Int8ub, function, this.b
 converted to a `Checksummed` with the function as its algorithm. To find the covered part, the
 expression of the Checksum is called with an object that records the names that the expression
 reads.
-
-The arguments with which a `SealedStruct` (the class of `Checksummed`) is made for one checksum are
-called a seal.
 """
 
 from __future__ import annotations
@@ -19,7 +16,7 @@ import construct
 from construct import Construct, Struct
 
 from lidarspec.spec.checksums import Checksum
-from lidarspec.spec.syntax.replacements import BoundedPart, SealedStruct
+from lidarspec.spec.syntax.replacements import BoundedPart, ChecksummedBase
 
 #: The maximum width of a checksum that is computed for many frames at once, in bits.
 MAX_CHECKSUM_BITS = 64
@@ -67,18 +64,18 @@ class _NameRecorder:
         return self[name]
 
 
-def extract_seals(members: Sequence[Construct]) -> tuple[list[Construct], list[dict[str, Any]]]:
+def extract_checksums(members: Sequence[Construct]) -> tuple[list[Construct], list[dict[str, Any]]]:
     """Replace each Checksum of a RawCopy by a plain field that stores the checksum.
 
     Args:
         members: the members of a struct.
 
     Returns:
-        The new members of the struct, and the seal of each replaced Checksum: the arguments of a
-        `SealedStruct`.
+        The new members of the struct, and for each replaced Checksum the arguments of a
+        `ChecksummedBase` (the base class of `Checksummed`).
     """
     found = list[Construct]()
-    seals = list[dict[str, Any]]()
+    checksums = list[dict[str, Any]]()
     for member in members:
         checksum = _strip(member)
         over = _find_covered_part(checksum, members) if member.name else None
@@ -88,21 +85,21 @@ def extract_seals(members: Sequence[Construct]) -> tuple[list[Construct], list[d
         names, takes_raw_copy = over
         width = 8 * int(checksum.checksumfield.sizeof())
         algorithm = FunctionChecksum(checksum.hashfunc, width, takes_raw_copy)
-        seals.append({"field": member.name, "algorithm": algorithm, "over": ".".join(names)})
+        checksums.append({"field": member.name, "algorithm": algorithm, "over": ".".join(names)})
         found.append(
             construct.Renamed(checksum.checksumfield, newname=member.name, newdocs=member.docs)
         )
-    return found, seals
+    return found, checksums
 
 
-def seal(struct: Construct, seals: Sequence[dict[str, Any]]) -> Construct:
-    """Wrap a struct in one `SealedStruct` for each checksum, one inside another.
+def add_checksums(struct: Construct, checksums: Sequence[dict[str, Any]]) -> Construct:
+    """Wrap a struct in one `ChecksummedBase` for each checksum, one inside another.
 
     Args:
-        seals: the arguments of each `SealedStruct`, the innermost first.
+        checksums: the arguments of each `ChecksummedBase`; that of the innermost struct is first.
     """
-    for arguments in seals:
-        struct = SealedStruct.plugin_class(struct, **arguments)
+    for arguments in checksums:
+        struct = ChecksummedBase.plugin_class(struct, **arguments)
     return struct
 
 

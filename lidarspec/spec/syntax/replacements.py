@@ -450,7 +450,7 @@ class DescribedField(Subconstruct):  # type: ignore[misc]
         raise NotImplementedError
 
 
-class SealedStruct(Subconstruct):  # type: ignore[misc]
+class ChecksummedBase(Subconstruct):  # type: ignore[misc]
     """A struct with a checksum.
 
     Attributes:
@@ -468,7 +468,7 @@ class SealedStruct(Subconstruct):  # type: ignore[misc]
 
     #: The class that plugins use, `Checksummed`. It also replaces construct's Checksum of a
     #: RawCopy.
-    plugin_class: Callable[..., SealedStruct]
+    plugin_class: Callable[..., ChecksummedBase]
 
 
 class SizeField(Subconstruct):  # type: ignore[misc]

@@ -31,11 +31,12 @@ from construct import (
 from construct.expr import ExprMixin
 
 from lidarspec.spec.enum_values import EnumValue
-from lidarspec.spec.syntax.raw_checksums import extract_seals, seal
+from lidarspec.spec.syntax.raw_checksums import add_checksums, extract_checksums
 from lidarspec.spec.syntax.replacements import (
     BareNamedTuple,
     BoundedPart,
     CheckedCompressed,
+    ChecksummedBase,
     CountedBytes,
     CountField,
     DescribedField,
@@ -52,7 +53,6 @@ from lidarspec.spec.syntax.replacements import (
     Partition,
     RawPart,
     Reserved,
-    SealedStruct,
     SizeField,
     SkippableCheck,
     SkippableChecksum,
@@ -156,9 +156,9 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
                 _to_count_field(member, members[number:])
                 for number, member in enumerate(members, 1)
             ]
-        members, checksums = extract_seals(members)
+        members, checksums = extract_checksums(members)
         prepared = (prepare(child, limit, in_bits=in_bits) for child in members)
-        return seal(MeasuredStruct(*prepared), checksums)
+        return add_checksums(MeasuredStruct(*prepared), checksums)
     if isinstance(con, construct.Renamed):
         # ("name" / con) * "docs" wraps twice, and the path would name it twice
         inner = prepare(_strip_name(con), limit, in_bits=in_bits)
@@ -678,12 +678,12 @@ def children(con: Construct) -> list[Construct]:
     return below + (list(con.cases.values()) if "cases" in vars(con) else [])
 
 
-def iter_seals(con: Construct) -> Iterator[SealedStruct]:
+def iter_checksummed(con: Construct) -> Iterator[ChecksummedBase]:
     """Yield the structs with checksums in a struct, outer structs first."""
-    if isinstance(con, SealedStruct):
+    if isinstance(con, ChecksummedBase):
         yield con
     for child in children(con):
-        yield from iter_seals(child)
+        yield from iter_checksummed(child)
 
 
 def iter_leaves(

@@ -189,9 +189,9 @@ def changed_struct() -> Checksummed:
             "last" / angle,
             "first" / angle,
             "returns" / Array(this.number, sample),
-            "seal" / Int16ul,
+            "checksum" / Int16ul,
         ),
-        field="seal",
+        field="checksum",
         algorithm=WordXor(),
     )
 
@@ -227,4 +227,4 @@ def test_decoding_follows_a_struct_with_renamed_and_reordered_fields() -> None:
     assert cloud.range.tolist() == [1, 2, 4, 8] * 2
     with pytest.raises(ls.WireError) as caught:
         other.parse(data[:-1] + bytes([data[-1] ^ 1]))
-    assert caught.value.path == "seal"
+    assert caught.value.path == "checksum"

@@ -200,10 +200,10 @@ def test_bits_of_every_profile_match_the_table() -> None:
 
 
 def test_a_wrong_crc_is_rejected_and_an_absent_one_accepted() -> None:
-    sealed = vector_bytes(FILE, "ouster_crc64_rng15")
+    checksummed = vector_bytes(FILE, "ouster_crc64_rng15")
     sensor = OS0.configure(rows=128, turn=512, profile="RNG15_RFL8_NIR8")
-    damaged = sealed[:100] + bytes([sealed[100] ^ 1]) + sealed[101:]
-    assert len(sensor.decode([sealed])) == 1
+    damaged = checksummed[:100] + bytes([checksummed[100] ^ 1]) + checksummed[101:]
+    assert len(sensor.decode([checksummed])) == 1
     assert len(sensor.decode([damaged])) == 0
     for crc in ABSENT_CRCS:
         assert len(sensor.decode([damaged[:-8] + crc.to_bytes(8, "little")])) == 1

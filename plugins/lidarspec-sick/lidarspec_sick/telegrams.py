@@ -61,10 +61,10 @@ def make_binary_frame(*parts: Construct, max_length: int = 0, **more: Any) -> Fr
         *parts,
         "checksum" / Int8ub,
     )
-    sealed = Checksummed(
+    struct_with_checksum = Checksummed(
         struct, field="checksum", algorithm=Xor(), over=tuple(part.name for part in parts)
     )
-    return Frame(sealed, max_length=max_length, **more)
+    return Frame(struct_with_checksum, max_length=max_length, **more)
 
 
 def make_text_frame(*parts: Construct, max_length: int = 200, **more: Any) -> Frame:
