@@ -159,7 +159,7 @@ class ChecksumWithConstant(Checksum):
         return (1 << self.width) - 1
 
     def _combine(self, values: Values) -> Values:
-        """Return values of the base checksum combined with the constant."""
+        """Combine each value of the base checksum with the constant; return the results."""
         constant = np.uint64(self.constant)
         if isinstance(self.base, Xor | WordXor):
             return values ^ constant

@@ -157,7 +157,7 @@ def _are_moderate(values: NDArray[Any]) -> bool:
 def _make_source(
     packets: PacketBatch, shares: list[LayoutGroup], batch: Batch, ready: int, stamp_ns: int
 ) -> BatchColumns:
-    """Return the columns of the points of the first `ready` packets."""
+    """Return the columns of points for the first packets; `ready` is their number."""
     plan = shares[0].plan
     grids = None
     size = ready * plan.width

@@ -244,8 +244,8 @@ class Checksummed(layer.ChecksummedBase):
             if self.over is None and inner.over is None:
                 both = f"the checksums {inner.fields[0]!r} and {self.fields[0]!r} cover each other"
                 raise SpecError(
-                    f"{both}: pass over= to the inner Checksummed, to name the fields that it"
-                    " covers"
+                    f"{both}: name the fields that {inner.fields[0]!r} covers, with over= of the"
+                    " inner Checksummed"
                 )
             inner = inner.subcon
 

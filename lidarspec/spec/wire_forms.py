@@ -1189,8 +1189,8 @@ class Escaped:
             or special & {b ^ self.xor for b in special}
         ):
             raise SpecError(
-                "flag and escape must be two different bytes, and no escaped byte may be"
-                " the flag or the escape",
+                "flag and escape must be two different bytes, and after XOR with `xor`"
+                " neither of them may be equal to the flag or the escape",
                 path="wire",
             )
 

@@ -50,9 +50,9 @@ def describe(plan: Plan) -> list[str]:
     )
     lines = [f"{plan.width} points per packet{': ' if axes else ''}{axes}"]
     plainly = [node for node in plan.tape.nodes if node in compiler.low or node in plan.eager_nodes]
-    lines.append(f"per packet or block, by the reference evaluator (values: {len(plainly)}):")
+    lines.append(f"{len(plainly)} values per packet or block, computed by the reference evaluator:")
     lines += [f"  {node.kind} {node.path}".rstrip() for node in plainly if node.kind != "call"]
-    lines.append(f"per chunk of {program.chunk} packets (lookup tables: {len(tables)}):")
+    lines.append(f"steps for each chunk of {program.chunk} packets (lookup tables: {len(tables)}):")
     outputs = {register: name for name, register in program.outputs.items()}
     for step in program.steps:
         if step.output in outputs:

@@ -5,12 +5,13 @@ two characters, and ND and NE with all echoes. GD, GE, GS, HD and HE request one
 that the laser was switched on with `laser_on`. Scans with any range of steps are decoded.
 ``configure(content=, first=, last=, cluster=)`` selects the scans that are requested.
 
-Source: SCIP 2.0, C-42-03320B (table 2: steps; 8: commands, and the reply of a URG-04LX to PP);
-UST-10LX/20LX, C-42-04076 (port). The ranges and the speed of a UST-10LX and a UTM-30LX-EW are from
-replies to PP that users have published. A UST-20LX and a UTM-30LX are assumed to report the same
-values as a UTM-30LX-EW, except that the shortest range of a UST-20LX is that of a UST-10LX. It is
-also assumed that only a URG-04LX accepts SS, CR and HS, and that a URG-04LX accepts neither ME nor
-GE. Several echoes are documented for the UTM-30LX-EW only.
+Source: SCIP 2.0, C-42-03320B (table 2 for the steps, table 8 for the commands and for the reply of
+a URG-04LX to PP), and C-42-04076 for the port of the UST-10LX and UST-20LX. The ranges and the
+speed of a UST-10LX and a UTM-30LX-EW are from replies to PP that users have published. A UST-20LX
+and a UTM-30LX are assumed to report the same values as a UTM-30LX-EW, except that the shortest
+range of a UST-20LX is that of a UST-10LX. It is also assumed that only a URG-04LX accepts SS, CR
+and HS, and that a URG-04LX accepts neither ME nor GE. Several echoes are documented for the
+UTM-30LX-EW only.
 """
 
 from __future__ import annotations
