@@ -114,7 +114,7 @@ class OpenScan(NamedTuple):
         packets: the number of packets of the scan.
         size: the size of the scan, in bytes or in points.
         lost: the number of packets missing in the scan.
-        is_broken: whether packets are missing in the scan, even if their number is unknown.
+        has_gap: whether packets are missing in the scan, even if their number is unknown.
     """
 
     has_start: bool = False
@@ -122,7 +122,7 @@ class OpenScan(NamedTuple):
     packets: int = 0
     size: float = 0
     lost: int = 0
-    is_broken: bool = False
+    has_gap: bool = False
 
     @property
     def is_whole(self) -> bool:
@@ -131,11 +131,6 @@ class OpenScan(NamedTuple):
         This requires the start of the scan, and at least half of its packets.
         """
         return self.has_start and self.lost <= self.packets
-
-    @property
-    def has_gap(self) -> bool:
-        """Whether any packet is missing."""
-        return self.lost > 0 or self.is_broken
 
     def add(self, packets: PacketCounts) -> OpenScan:
         """Add one or more packets, and return the counts of the scan."""
@@ -148,14 +143,14 @@ class OpenScan(NamedTuple):
             self.packets + _sum(packets.counts),
             self.size + _sum(packets.sizes),
             self.lost + _sum(packets.missing),
-            self.is_broken or bool(packets.follows_gap.any()),
+            self.has_gap or bool(packets.follows_gap.any()),
         )
 
     def add_gap(self, packets: PacketCounts) -> OpenScan:
         """Add the packets missing before `packets`, and return the counts of the scan."""
         return self._replace(
             lost=self.lost + _sum(packets.missing),
-            is_broken=self.is_broken or bool(packets.follows_gap.any()),
+            has_gap=self.has_gap or bool(packets.follows_gap.any()),
         )
 
 
