@@ -169,8 +169,9 @@ def find_records(
         form: the record reader of the file.
 
     Returns:
-        (The start of each record, followed by the end of the last record; whether `form.read` must
-        read the next record).
+        An array with the start of each record and, as its last element, the end of the last record
+        (only `start` if there is no complete record); and whether `form.read` must read the record
+        that begins at the last element.
     """
     pieces: list[Indices] = []
     single: list[int] = []
@@ -352,10 +353,10 @@ class StreamBatches(StreamReader, CaptureBatches):
 
 
 class _RecordBlock:
-    """The complete records in the buffer, or the one record to read singly.
+    """The complete records in the buffer, or one record that `form.read` must read.
 
-    There is one record if `find_records` found none: its length is implausible, or it is longer
-    than the data in the buffer.
+    The block has only the next record if `find_records` finds no complete record, because the
+    buffer contains only a part of the next record, or because `form.find_length` returns 0.
     """
 
     def __init__(
@@ -443,7 +444,7 @@ class _RecordBlock:
         else:
             buffer = np.empty(0, np.uint8)
         if self._singles:
-            buffer = self._append_singles(buffer, columns, matched, names)
+            buffer = self._add_singles(buffer, columns, matched, names)
         return CapturedDatagrams(
             buffer, columns[0], columns[1], columns[2], columns[3], tuple(names)
         )
@@ -462,17 +463,17 @@ class _RecordBlock:
             (kind.source,),
         )
 
-    def _append_singles(
+    def _add_singles(
         self,
         buffer: NDArray[np.uint8],
         columns: list[NDArray[Any]],
         matched: Indices,
         names: dict[Sender, int],
     ) -> NDArray[np.uint8]:
-        """Insert the singly read datagrams into `columns`, in the order of the records.
+        """Add the singly read datagrams to `columns`, in the order of the records.
 
         Returns:
-            `buffer`, followed by the payloads of these datagrams.
+            A longer buffer: `buffer`, followed by the payloads of the singly read datagrams.
         """
         data = b"".join(datagram.data for datagram in self._singles.values())
         at = len(buffer)

@@ -131,7 +131,8 @@ class CaptureReader(ClosingContext):
             compressed.
 
     Attributes:
-        max_buffer_bytes: maximum size of the read buffer, except for a longer record.
+        max_buffer_bytes: maximum size of the read buffer. The buffer exceeds this size only if a
+            single record does not fit into it.
 
     Raises:
         SourceError: if the file cannot be read, or is not a capture. Damage is only counted.
@@ -272,11 +273,11 @@ class StreamReader(CaptureReader):
     """Iterates over the packets of a captured byte stream, as datagrams."""
 
     def to_datagram(self, packet: CapturedPacket | NoPacketReason) -> Datagram | None:
-        """Count a packet; return its bytes as a datagram, or None.
+        """Count the packet of a record, and return its bytes as a datagram.
 
         Returns:
-            None if the record has no packet, or if the link type of the packet is not in
-            `USER_LINKS`.
+            The datagram. None if the link type of the packet is not in `USER_LINKS`, or if the
+            record has no packet, so that nothing is counted.
         """
         if isinstance(packet, NoPacketReason):
             return None

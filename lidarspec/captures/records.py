@@ -4,8 +4,9 @@
 record, with which `bulk` finds similar records. `seek_time` searches a file by capture time.
 
 Captures are untrusted: each read has a limited size, and each iteration of a loop advances or ends
-the reading. After a damaged record, `skip_damage` continues at the next record that it recognizes:
-in pcap by the record that follows, and in pcapng by the length that is repeated at the end.
+the reading. After a damaged record, `skip_damage` continues at the next bytes that look like a
+record. A pcap record must end at another plausible record, or at the end of the file. A pcapng
+block must be a section header, or repeat its length at its end.
 
 Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and "PCAP Now Generic
 Capture File Format" (draft-ietf-opsawg-pcapng).
@@ -287,9 +288,9 @@ class PcapRecords:
         return 0 < captured <= MAX_PACKET_BYTES and captured in (original, self._snap_length)
 
     def _has_wrong_length(self, captured: int, original: int) -> bool:
-        """Return whether a record begins within the packet, and none directly after it.
+        """Return whether the lengths in the header of a record are wrong.
 
-        Then the lengths are wrong, because the packet would include other records.
+        They are wrong if no record begins at the end of the packet, but one begins within it.
         """
         size = self._head.size + captured
         within = max(captured, min(original, MAX_PACKET_BYTES) + 1)

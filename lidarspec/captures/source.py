@@ -36,7 +36,8 @@ class BufferedInput:
     """A buffered reader of a file or pipe.
 
     Args:
-        max_buffer_bytes: maximum size of the buffer, except for a longer record.
+        max_buffer_bytes: maximum size of the buffer. The buffer exceeds this size only if a single
+            record does not fit into it.
 
     Attributes:
         storage: the current buffer. Its last `SLACK_BYTES` are never filled.
@@ -72,9 +73,9 @@ class BufferedInput:
         return self._bytes_dropped + self.at
 
     def open_at(self, offset: int) -> BufferedInput:
-        """Return a second source of the same file that starts at a file offset.
+        """Return a second `BufferedInput` that reads the same file from an offset.
 
-        Before using this source again, call `seek`: both sources share the position of the file.
+        Before using the first one again, call its `seek`: both share the position of the file.
         """
         return _open_source_at(self._file, MIN_BUFFER_BYTES, offset)
 
@@ -204,7 +205,7 @@ class BufferedInput:
 
 
 def _open_source_at(file: BinaryIO, max_buffer_bytes: int, offset: int) -> BufferedInput:
-    """Return a source of a seekable file that starts at an offset."""
+    """Return a `BufferedInput` that reads a seekable file from an offset."""
     file.seek(offset)
     source = BufferedInput(file, max_buffer_bytes=max_buffer_bytes)
     source.record = source._bytes_dropped = offset
