@@ -122,7 +122,7 @@ def select_columns(
     Requested columns that the scan does not have are omitted.
     """
     cloud = scan.points
-    existing = tuple(name for name in names if name == "valid" or cloud.has_column(name))
+    existing = tuple(name for name in names if name == "valid" or cloud.is_selected(name))
     cloud.load(*existing, "valid")
     columns = {
         name: getattr(cloud, name) if name in (*COLUMNS, "valid") else cloud.extra.get(name)

@@ -169,7 +169,7 @@ def describe_fields(cloud: PointCloud, points: NDArray[Any]) -> list[tuple[str, 
     lacking = {
         name
         for name in ("intensity", "ring", "time")
-        if not cloud.has_column(name) or getattr(cloud, name) is None
+        if not cloud.is_selected(name) or getattr(cloud, name) is None
     }
     return [
         (name, field[1], field[0].str[1:])

@@ -172,15 +172,16 @@ def _half_extent(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:
     return float((high - low)[:2].max()) / 2
 
 
-def round_up(value: float, rounds: Sequence[float] = ROUND_NUMBERS) -> float:
-    """Return the smallest round number that is at least a value, within 0.1 %.
+def round_up(value: float, round_numbers: Sequence[float] = ROUND_NUMBERS) -> float:
+    """Return the smallest round number that is at least 99.9 % of a value.
 
     Args:
-        rounds: the round numbers from 1 to 10. Their products with powers of ten are round, too.
+        round_numbers: the round numbers from 1 to 10. Their products with powers of ten are round,
+            too.
     """
     power = 10.0 ** math.floor(math.log10(value))
     return next(
-        (number * power for number in rounds if number * power >= value * 0.999), 10 * power
+        (number * power for number in round_numbers if number * power >= value * 0.999), 10 * power
     )
 
 

@@ -204,7 +204,7 @@ class BatchColumns(ColumnSource):
         for share in self._shares:
             count = len(share.group.rows[first:last])
             maker = compile_columns(share.plan, names, self._packets.backend, count)
-            filled.append(share.fill(maker, first, last))
+            filled.append(share.compute_columns(maker, first, last))
         return {
             name: self._flatten([columns[name] for columns in filled], column.dtype, start, stop)
             for name, column in filled[0].items()

@@ -105,10 +105,11 @@ class PointCloud:
         }
         return {name: column for name, column in columns.items() if column is not None}
 
-    def has_column(self, name: str) -> bool:
-        """Return whether `select_columns` has kept a column; always True for x, y and z.
+    def is_selected(self, name: str) -> bool:
+        """Return whether a column was selected by `select_columns`.
 
-        If no columns were selected, the result is True for every name.
+        If no columns were selected, the result is True for every name. The result is always True
+        for x, y and z, which some files require.
         """
         return not self.chosen or name in (*self.chosen, "x", "y", "z")
 
@@ -192,9 +193,10 @@ class PointCloud:
         return PointCloud(**{**picked, "shape": shape})
 
     def organise(self, columns: int) -> PointCloud:
-        """Return an image of a revolution: the columns of the points in order of their numbers.
+        """Return the points of a revolution as an image.
 
-        A missing column is filled with invalid points.
+        The columns of the image are in the order of the `column` numbers of the points. An image
+        column without points is filled with invalid points.
 
         Args:
             columns: the number of columns of a revolution. All points must be from one revolution.
@@ -272,7 +274,7 @@ class PointCloud:
         The fields are x y z intensity ring time. Missing columns are 0. Columns in `extra` begin at
         byte 32, each aligned to its size; the size of a point is then a multiple of 16.
         """
-        names = [name for name in STRUCTURED.names or () if self.has_column(name)]
+        names = [name for name in STRUCTURED.names or () if self.is_selected(name)]
         self.load(*names, *self.extra)
         columns = {name: getattr(self, name) for name in names} | dict(self.extra)
         structured = np.zeros(

@@ -106,8 +106,15 @@ class LayoutGroup:
     def __len__(self) -> int:
         return len(self.group.where)
 
-    def fill(self, maker: ColumnMaker, first: int, stop: int | None) -> dict[str, NDArray[Any]]:
-        """Return columns of packets `first` to `stop - 1`; a `stop` of None means all."""
+    def compute_columns(
+        self, maker: ColumnMaker, first: int, stop: int | None
+    ) -> dict[str, NDArray[Any]]:
+        """Return the columns that `maker` computes for some packets of the group.
+
+        Args:
+            first: the index of the first packet.
+            stop: the index after the last packet; None for the end of the group.
+        """
         rows = self.group.rows[first:stop]
         columns = maker.columns(len(rows))
 

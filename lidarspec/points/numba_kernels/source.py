@@ -274,7 +274,8 @@ class Expressions(KernelWriter):
         Args:
             exact: whether to compute the value in float64, and round only the result to float32.
             is_column: whether the expression is a whole column, such as a coordinate, and not a
-                part of an expression. If it is a sum, it is then computed in float32.
+                part of an expression. Unless `exact` is set, a sum that is a whole column is added
+                in float32. Any other sum is added in float64, and then rounded.
         """
         if not isinstance(value, Node):
             return self.write_constant(value, len(self.shape), "float32")

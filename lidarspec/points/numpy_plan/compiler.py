@@ -296,7 +296,8 @@ class Compiler:
     def _look_up_rows(self, node: Node, kind: str) -> int | None:
         """Compile a lookup of rows of a table.
 
-        Returns None unless a row contains one value for each point that has the same index.
+        Returns None unless each row of the table has one value for each of the points that use the
+        row, which are the points with the same index.
         """
         index, table = node.args
         inner = table.shape[1]
