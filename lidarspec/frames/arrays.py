@@ -41,7 +41,10 @@ def count_up(count: int) -> NDArray[np.int64]:
 
 
 def is_count_up(numbers: NDArray[np.int64]) -> bool:
-    """Return whether an array is a result of `count_up`, whose values ascend."""
+    """Return whether an array was made by `count_up`, so that its values ascend.
+
+    An array of more than `MAX_SHARED_COUNT` numbers is not recognized.
+    """
     return numbers.base is _shared_numbers() and numbers.strides[0] > 0
 
 

@@ -1,7 +1,7 @@
 """Check which structs can be compiled to layouts (`lidarspec.frames.layout`).
 
-A struct cannot be compiled if header fields do not determine the offsets of all fields. construct
-parses the frames of such a struct.
+A struct can be compiled only if the offsets of all fields depend on nothing but header fields and
+measured sizes (`lidarspec.frames.measured_size`). construct parses the frames of all other structs.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def _check_alternatives(node: tree.When | tree.Select) -> None:
         is_only_one = all(isinstance(other, tree.Empty) for other in others)
         names = {path for other in others for path in _list_names(other)}
         for part in tree.nodes(alternative):
-            path = _find_measured(part)
+            path = _get_measured_path(part)
             if path and (path in names or (part is alternative and not is_only_one)):
                 raise NotCompilableError(
                     path,
@@ -89,8 +89,8 @@ def _check_alternatives(node: tree.When | tree.Select) -> None:
                 )
 
 
-def _find_measured(node: tree.Node) -> str:
-    """Return the path of a node whose size is found by reading it; "" for other nodes."""
+def _get_measured_path(node: tree.Node) -> str:
+    """Return the path of `node` if its size is found by reading its content, else ""."""
     if isinstance(node, tree.PartSequence) and node.is_array:
         return node.axis
     if isinstance(node, tree.Blob) and node.ending is not None:

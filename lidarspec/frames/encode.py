@@ -118,7 +118,7 @@ class _Encoder:
         for axis, region in layout.regions.items():
             data = b"".join(parts[axis])
             row[0, region.start : region.start + len(data)] = np.frombuffer(data, np.uint8)
-        layout.complete_header(row)
+        layout.write_constants(row)
         for checksum in layout.checksums:
             if not self._is_absent(checksum, row):
                 checksum.fill(row)

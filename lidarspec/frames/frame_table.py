@@ -666,9 +666,9 @@ def _collect_elements(parsed: list[Any], names: list[str], axes: int) -> list[An
 
 
 def _find_present(value: Any) -> Any:
-    """Return whether a value is not None; for nested lists, return nested lists.
+    """Return whether a value is not None.
 
-    A list in which no value is None becomes True.
+    For a list, return the results of its elements: True if all of them are True, else a list.
     """
     if not isinstance(value, list):
         return value is not None
@@ -698,7 +698,8 @@ def _collect_lengths(value: Any, names: list[str], brackets: int) -> set[int]:
 
     Args:
         names: the names in the path from `value` to the array.
-        brackets: the number of arrays directly around the array, as in ``names[][]``.
+        brackets: the number of arrays that contain the array directly, without a struct between
+            them: 2 for the innermost array of a field with three dimensions, ``names[][]``.
     """
     if isinstance(value, list) and (names or brackets):
         below = brackets if names else brackets - 1

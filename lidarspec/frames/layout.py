@@ -345,8 +345,8 @@ class Derivation:
         strides: the difference between the values of consecutive elements along each array.
         formula: a formula of fields of the frame; None if the value is computed from `start`.
         start: the value of the first element.
-        picked: if elements are selected, the index in each array, which is None for all elements of
-            this array; otherwise ().
+        picked: for each array, the index of the selected element, or None if all elements of the
+            array are selected; () if all elements of all arrays are selected.
     """
 
     info: FieldInfo
@@ -606,7 +606,8 @@ class LayoutRefusal:
         error: the error of the plugin expression; None for the other reasons.
         has_wrong_constant: whether a constant is wrong.
         constants: for invalid lengths, the constants before the field that makes the frame too
-            long, as (mask, value) by offset. They may be wrong as well.
+            long, as (mask, value) by offset. They still have to be compared with the frames, whose
+            constants may be wrong as well.
     """
 
     error: PluginError | None = None
@@ -705,12 +706,12 @@ class Layout:
 
     def complete_rows(self, rows: Bytes2D) -> None:
         """Write constants, lengths and checksums into frames given as rows of bytes."""
-        self.complete_header(rows)
+        self.write_constants(rows)
         for checksum in self.checksums:
             checksum.fill(rows)
 
-    def complete_header(self, rows: Bytes2D) -> None:
-        """Write constants, and values that the header implies, into rows of bytes."""
+    def write_constants(self, rows: Bytes2D) -> None:
+        """Write the constants, and the values in `following`, into rows of bytes."""
         for leaf, value in self.following:
             leaf.store(rows, value)
         set_bits(rows, self.known)

@@ -68,7 +68,10 @@ class InvalidLengthError(Exception):
 
 
 class InvalidCaseError(InvalidLengthError):
-    """The header selects a case that no valid frame has (construct's `Error`)."""
+    """The header selects a case that no valid frame has (construct's `Error`).
+
+    Frames with such a header are rejected like frames with invalid lengths.
+    """
 
 
 class UnknownPartError(Exception):
@@ -91,8 +94,8 @@ def find_layout(
 
     Raises:
         UnknownSelectorError: if the layout depends on a selector that is not in `values`.
-        InvalidLengthError: if the frame would be longer than `limit`, or have no bytes, or if the
-            header selects a case that no valid frame has.
+        InvalidLengthError: if the frame would be longer than `limit`, or have no bytes.
+        InvalidCaseError: if the header selects a case that no valid frame has.
         UnknownPartError: if the constants of a part match no kind of parts.
         NotCompilableError: if only construct can parse the struct.
         Exception: any error of a formula with these values.
@@ -672,7 +675,10 @@ class _ValueClasses:
         return cls(info.limits, low, high)
 
     def limit_to(self, value: int) -> _ValueClasses:
-        """Let `value` represent all larger values, if none makes the frame shorter."""
+        """Let `value`, for which there is no layout, represent all larger values.
+
+        Returns the classes unchanged if a larger value may make the frame shorter.
+        """
         if self.monotonic_from is not None and self.monotonic_from <= value < self.high:
             return replace(self, high=value)
         return self
@@ -732,8 +738,8 @@ class _CandidateSet:
     A candidate is an offset in a buffer at which a frame may start.
 
     Attributes:
-        refuted: the indices of the candidates that have no layout, because the header is incomplete
-            or the frame would be too long, and have a wrong constant.
+        refuted: the indices of the candidates with a wrong constant, among the candidates that have
+            no layout because the header is incomplete or the frame would be too long.
     """
 
     def __init__(
@@ -750,7 +756,7 @@ class _CandidateSet:
         self.refuted: list[NDArray[np.intp]] = []
 
     def get_longest_bytes(self, which: NDArray[np.intp]) -> bytes | memoryview:
-        """Return the available bytes of the longest of some candidates, at most `limit`."""
+        """Return up to `limit` bytes of the candidate that has the most bytes."""
         first = which.item(0)
         if self.stops is not None and len(which) > 1:
             first = which.item((self.stops[which] - self._offsets[which]).argmax())

@@ -62,14 +62,14 @@ class MeasuredSize(ABC):
 
         Returns:
             The indices of the candidates in which the size was found (None for all candidates), and
-            the sizes. For invalid content, the size is a status such as `LENGTH` with a minus sign.
+            the sizes. For invalid content, the size is a negated status, such as `-LENGTH`.
         """
 
     @abstractmethod
     def load(self, rows: Bytes2D) -> NDArray[Any]:
         """Return the size in each frame, given as a row of bytes, (n,).
 
-        For invalid content, the size is a status such as `LENGTH` with a minus sign.
+        For invalid content, the size is a negated status, such as `-LENGTH`.
         """
 
     def read_first(self, frame: bytes | memoryview) -> int | None:

@@ -1,4 +1,4 @@
-"""Format physical values with the decimals that tell the values of a field apart."""
+"""Format physical values with enough decimals to distinguish the values of a field."""
 
 from __future__ import annotations
 

@@ -199,7 +199,10 @@ def _find_field_fault(
     """Return the first fault of a frame's fields as an error."""
     fault = _run_search(sensor, name, diagnose.find_fault, examined)
     if fault is None:  # a checksum of a plugin returned a different value this time
-        reason = "the frame was found to be invalid, but a second check has found no fault"
+        reason = (
+            "the frame was invalid, but valid when it was checked again: a checksum function of the"
+            " plugin may return different values for the same bytes"
+        )
         return WireError(reason, sensor=sensor.id, frame=name, data=data)
     return _to_wire_error(sensor, name, data, fault, to_wire_offset)
 

@@ -38,8 +38,8 @@ SPELLING = "_wire"
 MAX_SHOWN_BYTES = 12
 
 
-class _Undecoded(Decoded):
-    """The result of `Coder.decode`: the bytes of the struct are those of the frame."""
+class _UnchangedFrame(Decoded):
+    """The result of `Coder.decode`: a struct whose bytes are those of the frame."""
 
     @property
     def offsets(self) -> list[int]:
@@ -64,7 +64,7 @@ class Coder:
 
     def decode(self, data: bytes) -> Decoded:
         """Decode one frame up to the first error."""
-        return _Undecoded(data, (), len(data))
+        return _UnchangedFrame(data, (), len(data))
 
     def encode(self, struct: bytes, spelling: object = None) -> bytes | None:
         """Return the frame for the bytes of a struct.
