@@ -72,7 +72,8 @@ class JoinedMessages:
         at: the arrival time of each message, ns.
         places: the offset of each message in the input.
         dropped: the number of bytes that were dropped before each message, and after the last one.
-        heads: the number of bytes outside the payloads, such as headers, in all fragments.
+        header_bytes: the total number of bytes outside the payloads, such as headers, in all
+            fragments that arrived.
     """
 
     buffer: NDArray[np.uint8]
@@ -81,7 +82,7 @@ class JoinedMessages:
     at: NDArray[np.int64]
     places: NDArray[np.int64]
     dropped: NDArray[np.int64]
-    heads: int
+    header_bytes: int
 
 
 class FragmentAssembler:
@@ -132,7 +133,7 @@ class FragmentAssembler:
         places = list[int]()
         times = list[int]()
         dropped = list[int]()
-        heads = 0
+        header_bytes = 0
         for start, size, time in zip(
             np.asarray(starts).tolist(), sizes.tolist(), at.tolist(), strict=True
         ):
@@ -140,7 +141,7 @@ class FragmentAssembler:
             fragment = self._parse_fragment(datagram)
             whole: tuple[bytes, int] | None = (datagram, base)
             if fragment is not None:
-                heads += size - len(fragment.payload)
+                header_bytes += size - len(fragment.payload)
                 whole = self._store(fragment, base, time)
             if whole is not None:
                 data.append(whole[0])
@@ -159,7 +160,7 @@ class FragmentAssembler:
             np.array(times, np.int64),
             np.array(places, np.int64),
             np.array([*dropped, left], np.int64),
-            heads,
+            header_bytes,
         )
 
     def give_up(self) -> int:

@@ -31,7 +31,7 @@ from lidarspec.framing.results import (
 )
 
 
-def sort_datagrams(
+def classify_datagrams(
     framing: Framing, buffer: Bytes1D, starts: Numbers, sizes: Indices, state: SearchState
 ) -> PieceResult:
     """Find the type of each datagram.
@@ -47,7 +47,7 @@ def sort_datagrams(
     regular_frames = find_regular_datagrams(framing, buffer, starts, sizes, state)
     if regular_frames is not None and regular_frames.is_all_valid:
         return PieceResult(regular_frames, len(buffer))
-    return _DatagramBatch(framing, buffer, to_array(starts), sizes, regular_frames).sort(state)
+    return _DatagramBatch(framing, buffer, to_array(starts), sizes, regular_frames).classify(state)
 
 
 class _DatagramBatch:
@@ -73,19 +73,19 @@ class _DatagramBatch:
         self._known: dict[str | None, tuple[int, Frames, Status, list[int]]] = {}
         self._piece = PieceResult(Frames.make_empty(buffer), len(buffer))
 
-    def sort(self, state: SearchState) -> PieceResult:
+    def classify(self, state: SearchState) -> PieceResult:
         """Find the type of each datagram."""
         position = 0
         parts = list[Frames]()
         while position < len(self._starts):
-            part = self._sort_from(position, state)
+            part = self._classify_from(position, state)
             parts.append(part)
             position += len(part)
         if parts:
             self._piece.frames = Frames.join(parts)
         return self._piece
 
-    def _sort_from(self, position: int, state: SearchState) -> Frames:
+    def _classify_from(self, position: int, state: SearchState) -> Frames:
         """Find the types of the datagrams, beginning with index `position`.
 
         The result ends with the first frame that changes the active types.
@@ -190,8 +190,8 @@ class _DatagramBatch:
     ) -> Frames:
         """Count invalid datagrams.
 
-        A datagram for which the plugin failed may have failed because of other datagrams. It is
-        checked again alone first, and may be valid.
+        If the plugin raised an error for a datagram, the cause may be another datagram of the
+        batch. Such a datagram is checked again alone, and is only counted if it is still invalid.
 
         Args:
             lost: the indices of the invalid datagrams.

@@ -21,7 +21,7 @@ from lidarspec.frames.arrays import broadcast_value, keep_freed_memory, repeat
 from lidarspec.frames.layout import Sums
 from lidarspec.framing.candidates import Bytes1D, Framing, PieceResult, SearchState
 from lidarspec.framing.datagram_assembly import FragmentAssembler, JoinedMessages
-from lidarspec.framing.datagrams import sort_datagrams
+from lidarspec.framing.datagrams import classify_datagrams
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.regular_rows import find_regular_frames
 from lidarspec.framing.results import Counters, Found, Frames, Numbers, to_array
@@ -266,10 +266,10 @@ class Decoder:
             sizes = joined.sizes
             at = joined.at
             places = joined.places
-            self.stats.bytes_skipped += joined.heads
-            self.stats.bytes_filler += joined.heads
+            self.stats.bytes_skipped += joined.header_bytes
+            self.stats.bytes_filler += joined.header_bytes
             self.stats.pending = self._assembly.pending
-        piece = sort_datagrams(self.framing, buffer, starts, sizes, self._state)
+        piece = classify_datagrams(self.framing, buffer, starts, sizes, self._state)
         frames = piece.frames
         self._base = self._base + total
         self.stats.bytes_in = self.stats.bytes_in + total

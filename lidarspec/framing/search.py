@@ -45,7 +45,7 @@ def find_frames(
     """
     candidates = Candidates(framing, buffer, state, final=final)
     piece = PieceResult(Frames.make_empty(candidates.buffer), len(candidates.buffer))
-    stays = [(0, state.after)]
+    periods = [(0, state.after)]
     walks = dict[str | None, _FrameWalk]()
     position = 0
     while position < piece.end:
@@ -65,14 +65,14 @@ def find_frames(
         if state.changed - before >= MIN_STAY_BYTES:
             piece.end = position
             break
-        stays.append((position, state.after))
+        periods.append((position, state.after))
     parts = [frames for walk in walks.values() for frames in walk.frames()]
     if parts:
         piece.frames = Frames.join(parts)
         if len(parts) > 1:
             piece.frames = piece.frames.select(np.argsort(piece.frames.starts))
-        _remember_size(state, piece.frames, stays[-1][0])
-    count_rejected(framing, piece, candidates, stays)
+        _remember_size(state, piece.frames, periods[-1][0])
+    count_rejected(framing, piece, candidates, periods)
     return piece
 
 
@@ -240,18 +240,18 @@ def count_rejected(
     framing: Framing,
     piece: PieceResult,
     candidates: Candidates,
-    stays: list[tuple[int, str | None]],
+    periods: list[tuple[int, str | None]],
 ) -> None:
     """Count the rejected candidates outside of accepted frames.
 
     Args:
-        stays: for each set of types that was active, the offset from which on it was active, and
-            the value of `SearchState.after` there.
+        periods: (offset, `SearchState.after`) of each period with the same active types. A period
+            begins at its offset, and ends at the offset of the next period.
     """
     frames = piece.frames
-    begins = np.array([begin for begin, _ in stays])
-    numbers = {name: number for number, name in enumerate({name for _, name in stays})}
-    modes = np.array([numbers[name] for _, name in stays])
+    begins = np.array([begin for begin, _ in periods])
+    numbers = {name: number for number, name in enumerate({name for _, name in periods})}
+    modes = np.array([numbers[name] for _, name in periods])
     for kind, own in candidates.checked.items():
         status = own.status
         if framing.is_weak(kind):  # a valid candidate that was not accepted is in no run
@@ -264,7 +264,7 @@ def count_rejected(
         offsets = own.starts[refused]
         is_counted = offsets < piece.end
         after = framing.codecs[kind].frame.after
-        if len(stays) > 1 and after is not None:
+        if len(periods) > 1 and after is not None:
             own_modes = modes[begins.searchsorted(offsets, side="right") - 1]
             is_counted &= own_modes == numbers.get(after, -1)
         if len(frames):
