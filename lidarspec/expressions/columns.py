@@ -62,9 +62,10 @@ class Batch:
         defaults: the declared defaults of state columns, by frame type and path.
         carry: the values from the previous batch that each call of `previous` or `last` needs:
             number of the call in the function, from 0 -> values.
+        carry_functions: for each call of `previous` or `last` so far, a function that returns the
+            values for `carry` of the next batch. The argument of the function is the index of the
+            packet with which the next batch begins.
         nominal: whether a declared default of a state column was used.
-        left: for each of these calls so far, a function that returns the values for the next batch.
-            Its argument is the index of the packet with which the next batch begins.
     """
 
     table: Table
@@ -73,7 +74,7 @@ class Batch:
     defaults: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     carry: Carry = field(default_factory=dict)
     nominal: bool = False
-    left: list[Callable[[int], NDArray[np.float64]]] = field(default_factory=list)
+    carry_functions: list[Callable[[int], NDArray[np.float64]]] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.table)
@@ -84,7 +85,7 @@ class Batch:
         Args:
             ready: the index of the packet with which the next batch begins.
         """
-        return {slot: rest(ready) for slot, rest in enumerate(self.left)}
+        return {slot: carry(ready) for slot, carry in enumerate(self.carry_functions)}
 
     def of(self, group: LayoutRows) -> Batch:
         """Return a batch with only the packets of a group, without `carry`."""
@@ -136,8 +137,11 @@ class Column(NDArrayOperatorsMixin):
         return self.array.shape
 
     @property
-    def seen(self) -> NDArray[Any]:
-        """The values; of a column in `graph.trace`, only the values of the sample packets."""
+    def known_values(self) -> NDArray[Any]:
+        """All values of the column.
+
+        A `graph.TracedColumn` has only the values of sample packets.
+        """
         return self.array
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -305,7 +309,7 @@ class Column(NDArrayOperatorsMixin):
         """
         row = FlatColumn(self)
         size = abs(step)
-        slot = len(self.batch.left)
+        slot = len(self.batch.carry_functions)
         carried = self.batch.carry.get(slot, np.empty(0))
         if len(carried):
             values = np.concatenate([carried, row.values])
@@ -327,7 +331,7 @@ class Column(NDArrayOperatorsMixin):
                 ready,
                 int(np.searchsorted(row.starts, certain, side="right")) - 1 if certain >= 0 else 0,
             )
-        self.batch.left.append(
+        self.batch.carry_functions.append(
             lambda upto: _take_connected_tail(
                 values, edges, len(carried) + row.starts[upto], 0 if step > 0 else size
             )
@@ -353,12 +357,12 @@ class Column(NDArrayOperatorsMixin):
             for array in (values, flags)
         ]
         row, known = (FlatColumn(column) for column in both)
-        slot = len(self.batch.left)
+        slot = len(self.batch.carry_functions)
         carried = self.batch.carry.get(slot, np.full(1, np.nan))
         numbers = np.concatenate([carried, row.values])
         starts = np.concatenate([[0], 1 + np.flatnonzero(known.values > 0)])
         latest = np.repeat(numbers[starts], np.diff(starts, append=len(numbers)))
-        self.batch.left.append(lambda upto: latest[: 1 + row.starts[upto]][-1:])
+        self.batch.carry_functions.append(lambda upto: latest[: 1 + row.starts[upto]][-1:])
         return Column(row.unflatten(latest[1:]), axes, self.batch, ready=ready)
 
 
@@ -441,7 +445,7 @@ def align(
     if (
         columns
         and all(column.axes == columns[0].axes for column in columns)
-        and _need_no_alignment(values)
+        and _are_columns_or_numbers(values)
     ):
         arrays = [
             value.array if isinstance(value, Column) else np.asarray(value) for value in values
@@ -512,7 +516,8 @@ def _merge_axis_names(first: str | None, name: str | None) -> str | None:
         name: the name of the axis of the other value; None if it has no name.
 
     Raises:
-        SpecError: if two names that were not guessed belong to different arrays.
+        SpecError: if the names belong to different arrays, and neither name was guessed (a guessed
+            name begins with "?", see `Column`).
     """
     if first is None or name is None:
         return first or name
@@ -733,8 +738,7 @@ def _describe_lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None
     return ", ".join(texts)
 
 
-def _need_no_alignment(values: tuple[Any, ...]) -> bool:
-    """Return whether operands with the same axes are all columns or numbers."""
+def _are_columns_or_numbers(values: tuple[Any, ...]) -> bool:
     return all(isinstance(value, Column | int | float) for value in values)
 
 

@@ -107,7 +107,8 @@ class Node:
     def _operands(self) -> list[tuple[bool, Any]]:
         """A pair for each argument.
 
-        (True, the axes of length 1 to append) for a node, (False, the array) for a constant.
+        For a node, the pair is True and a shape: the axes of length 1 to append to the values. For
+        a constant, the pair is False and the constant as an array.
         """
         depth = max(len(arg.sample.axes) for arg in self.args if isinstance(arg, Node))
         return [
@@ -178,7 +179,7 @@ class TracedColumn(NDArrayOperatorsMixin):
         self._tape = tape
 
     @property
-    def seen(self) -> NDArray[Any]:
+    def known_values(self) -> NDArray[Any]:
         """The values of the sample packets, with which the function is traced."""
         return self.node.sample.array
 
@@ -759,8 +760,8 @@ def _scale_terms(value: Node, parts: list[Term], factor: Any) -> list[Term]:
     """Return the terms of the product of a sum and a factor.
 
     Args:
-        value: the node of the product. It is the only term of the result if a factor that is a row
-            meets a term with a value for each point.
+        value: the node of the product. If the factor is a row, and a term of the sum has a value
+            for each point, this node is returned as the only term.
         parts: the terms of the sum.
         factor: a number, or a row of numbers that all packets share.
     """

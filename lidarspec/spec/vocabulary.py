@@ -335,7 +335,7 @@ class TableLookup:
 
 
 def _refuse_whole_turns(turn: Array, full: float) -> None:
-    angles = np.asarray(turn.seen if hasattr(turn, "seen") else turn, np.float64)
+    angles = np.asarray(turn.known_values if hasattr(turn, "known_values") else turn, np.float64)
     moved = angles[angles != 0]
     if moved.size and not np.mod(moved, full).any():
         reason = (
