@@ -94,7 +94,8 @@ class DeviceClock:
     All results are late by the shortest time that a packet needs to reach the host.
 
     Args:
-        parts: the number of quarters of a second, up to the newest, to which the line is fitted.
+        parts: the length of the time range to which the line is fitted, in units of 0.25 s. The
+            time range ends at the newest packet.
 
     Attributes:
         jumps: how often the sensor's clock was set.

@@ -80,12 +80,16 @@ class ClockOrder:
         self._jump: tuple[int, RecentPacket] | None = None
 
     def push(self, batch: Batch, times: Times) -> tuple[Numbers, NDArray[np.int64]]:
-        """Return the index and the order of each packet, (n,), and mark breaks.
+        """Find the place of each packet in the stream, and mark breaks.
 
         Args:
             batch: the packets. `batch.breaks` is set to True for each packet before which packets
                 were lost or the clock was set.
             times: times by the sensor's clock, (n,) ns.
+
+        Returns:
+            (index, order), each with one number per packet, (n,). The index is a sequence number
+            that also counts lost packets. The order is the time in ns by which packets are sorted.
         """
         paces = read_paces(self._clock, batch)
         if self._gaps is not None:

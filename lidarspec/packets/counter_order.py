@@ -54,8 +54,8 @@ class CounterReadings:
         has_counter: whether each packet has the counter, (n,); None if all packets have it.
         times: the times by the sensor's clock, (n,) ns; None if there is no clock, or if the
             pace of the clock is not declared.
-        steps: the time since the previous packet, (n,) ns; None if `times` is None.
-        paces: the time between each packet and the packet before, (n,) ns; nan if unknown.
+        steps: the measured time since the previous packet, (n,) ns; None if `times` is None.
+        paces: the declared time since the previous packet (`Clock.pace`), (n,) ns; nan if unknown.
     """
 
     numbers: NDArray[Any]

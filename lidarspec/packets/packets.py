@@ -382,7 +382,7 @@ def _nested_dtype(
             continue
         seen.add(name)
         here = prefix + name
-        if len(_list_forms(schema, here)) > 1:
+        if len(_find_meanings(schema, here)) > 1:
             raise SpecError(
                 "the field is a value in some frames, and a struct or an array in others: read"
                 " each column of the field by its full name",
@@ -400,8 +400,12 @@ def _nested_dtype(
     return np.dtype(members)
 
 
-def _list_forms(schema: Schema, here: str) -> set[tuple[bool, int]]:
-    """Return the forms of a path, each as (is a value, number of array axes)."""
+def _find_meanings(schema: Schema, here: str) -> set[tuple[bool, int]]:
+    """Return the different meanings of a path in the frames.
+
+    Each is (is_value, depth): whether the path is a value, not a struct, and the number of array
+    axes of the path itself.
+    """
     # A struct with branches can have a value in one branch, and a struct in another one.
     parts = [
         (path, info)

@@ -259,7 +259,7 @@ class PacketStream:
         }
 
     def _select_others(self, parts: Sequence[OwnFrames]) -> dict[str, list[OtherFrames]]:
-        """Return the new frames of the other types in the state, by frame type."""
+        """Return the new frames of the types in the packets' state, by frame type."""
         selected: dict[str, list[OtherFrames]] = {}
         packet_count = 0
         for part in parts:
