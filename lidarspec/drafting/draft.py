@@ -90,8 +90,8 @@ class Draft:
         blocks: repeated blocks of a frame; None if a frame has no blocks.
         checksum: the checksum; None if none was found.
         others: further checksums that match the frames.
-        common_bytes: if the length field counts bytes, the number of bytes at the start of every
-            frame in which fields are searched; otherwise 0.
+        common_bytes: if a length field counts bytes, the number of bytes that every frame has at
+            its start, so that these bytes are searched for fields; otherwise 0.
     """
 
     datagrams: bool

@@ -446,7 +446,7 @@ def _find_fixed_length(data: NDArray[np.uint8]) -> FrameStructure | None:
     framed = [
         (weight, structure)
         for lag in likely
-        for weight, structure in _iter_frames_of_length(data, lag)
+        for weight, structure in _iter_structures_of_length(data, lag)
         if structure.share > MIN_FRAMED_SHARE
     ]
     best = max((weight for weight, _ in framed), default=0.0)
@@ -461,17 +461,20 @@ def _find_fixed_length(data: NDArray[np.uint8]) -> FrameStructure | None:
 
 
 def _split_groups(data: NDArray[np.uint8], whole: FrameStructure) -> FrameStructure:
-    """Return the structure of the single frames if frames were found in groups.
+    """Split the frames of a structure if each of them is a group of several frames.
 
     Args:
-        whole: the structure that was found, which is returned if its frames are not groups.
+        whole: the structure that was found in the data.
+
+    Returns:
+        The structure of the single frames; `whole` if its frames are not groups.
     """
     # frames can repeat in groups, for example because an index in the frames counts from 0 to 5
     period = whole.period or 0
     for part_size in range(MIN_FRAME_BYTES, period // 2 + 1):
         if period % part_size:
             continue
-        for _, structure in _iter_frames_of_length(data, part_size):
+        for _, structure in _iter_structures_of_length(data, part_size):
             if structure.share > whole.share - SHARE_TOLERANCE and (
                 len(set(structure.sync)) > 1 or _has_counter(structure)
             ):
@@ -484,13 +487,12 @@ def _has_counter(structure: FrameStructure) -> bool:
     return any(field.kind == "counter" for field in find_rising_fields(rows))
 
 
-def _iter_frames_of_length(
+def _iter_structures_of_length(
     data: NDArray[np.uint8], period: int
 ) -> Iterator[tuple[float, FrameStructure]]:
-    """Yield the structure with frames of the length `period`, if there are any.
+    """Yield (weight, structure) for the frames of the length `period`, if any.
 
-    The structure comes after its weight, which is the share of the data that consists of constant
-    bytes.
+    The weight is the share of the data that consists of constant bytes.
     """
     count = len(data) // period
     rows = data[: count * period].reshape(count, period)

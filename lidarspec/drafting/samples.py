@@ -228,7 +228,8 @@ class SampleFrames:
         Args:
             number: maximum number of frames of the most frequent length. The result also has up to
                 two frames of each of up to `number` other lengths.
-            pick: a number from 0, which selects the frames of each length.
+            pick: the number of the selection, from 0. With another number, other frames of the same
+                lengths are selected if there are enough.
         """
         largest = max(self.groups, key=len)
         step = max(1, len(largest) // number)
