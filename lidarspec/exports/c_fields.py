@@ -183,8 +183,8 @@ class CEntry:
     def condition(self) -> str:
         """The C condition under which a C function returns the value of this entry.
 
-        This is `full_condition`, and for a part in an array inside a bit block, also the comparison
-        of the array indices. The condition is "" if the entry always has the value.
+        This is `full_condition`. For a part in an array inside a bit block, the array indices must
+        also be those of the part. The condition is "" if the function always returns this value.
         """
         inside = [
             f"{name_index(self.depth + level)} == {number}"

@@ -264,7 +264,7 @@ def node_data(node: tree.Node) -> dict[str, Any]:
 
 
 def _parts_data(node: tree.PartSequence) -> dict[str, Any]:
-    """Return a sequence of frames in a frame as JSON data: the kinds, and the end."""
+    """Return the JSON data of a field that contains a sequence of frames."""
     rules = {"count": node.count, "size": node.size, "within": node.within}
     data = {name: formula_data(rule) for name, rule in rules.items()}
     kinds = [

@@ -121,12 +121,12 @@ def format_integer(formula: tree.Formula, scope: Scope) -> str:
     return tree.format_formula(formula, functools.partial(format_reference, scope), _OPERATIONS)
 
 
-def _format_of_last_part(formula: tree.Formula, scope: Scope) -> str:
-    """Return a formula that Kaitai evaluates after each part to find the last part.
+def _format_part_formula(formula: tree.Formula, scope: Scope) -> str:
+    """Return the Kaitai expression of a formula that is evaluated after each part.
 
     Args:
-        formula: the condition. A path in it that begins with "_." is a field of the frame, and any
-            other path is a field of the part.
+        formula: the formula, which tells whether another part follows. A path in it that begins
+            with "_." is a field of the frame, and any other path is a field of the part.
     """
 
     def format_field(ref: tree.Ref) -> str:
@@ -283,9 +283,9 @@ def _find_bit_order(block: tree.Block) -> tuple[list[tree.BlockInteger], str] | 
 
 
 def _find_starts(bits: BitField, suffix: str) -> set[int]:
-    """Return the bit position of the field's begin, calculated from each segment.
+    """Return the bit positions at which a field begins according to its segments.
 
-    A single position means that the bits of the field are consecutive, so that Kaitai can read it.
+    If there is only one position, the bits of the field are consecutive, and Kaitai can read it.
 
     Args:
         suffix: the bit order, "be" or "le".
@@ -486,14 +486,14 @@ class _KaitaiWriter:
         if node.count is not None:
             more |= {"repeat": "expr", "repeat-expr": _format_size(node.count, scope)}
         elif node.size is not None and kind.following is not None:
-            ends = _format_of_last_part(kind.following, scope)
+            ends = _format_part_formula(kind.following, scope)
             if "if" in more:
                 condition = f"({more['if']}) and {format_integer(node.size, scope)} != 0"
             else:
                 condition = f"{format_integer(node.size, scope)} != 0"
             more |= {"repeat": "until", "repeat-until": f"{ends} == 0", "if": condition}
         elif kind.until is not None:
-            ends = _format_of_last_part(kind.until, scope)
+            ends = _format_part_formula(kind.until, scope)
             more |= {"repeat": "until", "repeat-until": f"{ends} != 0"}
         self._add_typed(kaitai, node.name, kind.element, scope, **more)
 
