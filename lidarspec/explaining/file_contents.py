@@ -97,8 +97,8 @@ class SensorContent:
         options: command-line options that select the sensor; "" if the file names the sensor.
         reading: statistics of the decoded part, such as scans per second; None if the data cannot
             be decoded.
-        incomplete_returns: the number of groups with a lost packet in the decoded part, if the
-            sensor sends the returns of the same firings in a group of packets.
+        incomplete_returns: for a sensor that sends the returns of the same firings in a group of
+            packets, the number of groups in the decoded part that lack a packet; otherwise 0.
         info: the facts that the sensor reports about itself in the decoded part, by name.
         clock: a description of the sensor's clock in the decoded part; "" if the sensor sends no
             time.

@@ -152,16 +152,16 @@ def _split_input(
 def explain_piece(
     sensor: Sensor, piece: InputPiece, frame: str | None = None
 ) -> Iterator[tuple[InputPiece, Explanation]]:
-    """Yield a piece with its explanation.
+    """Yield a piece, or the pieces into which it is split, each with its explanation.
 
-    Bytes without a valid frame are split into damaged frames and the bytes between these frames.
+    Bytes that are not in a frame are split into damaged frames and the bytes between these frames.
 
     Args:
-        frame: the frame type by which a piece of the type `NEAREST` is explained; by default the
-            type that fits best.
+        frame: the frame type by which a `NEAREST` piece (a short input that is probably one damaged
+            frame) is explained; by default the type that fits best.
 
     Raises:
-        WireError: if the bytes of a piece of the type `NEAREST` do not begin like a frame.
+        WireError: if the bytes of a `NEAREST` piece do not begin like a frame.
     """
     if piece.frame:
         yield piece, explain(piece.data, sensor, piece.frame if piece.is_valid else frame)
