@@ -202,10 +202,10 @@ class CaptureThread:
         self.transport.close()
 
     def record(self, log: TrafficLog | None) -> None:
-        """Start or replace the recording.
+        """Start, replace or stop the recording.
 
-        Events that are already in the queue are discarded, because they are not in the new
-        recording. After this call, the consumer gets only recorded events.
+        Events that are already in the queue are discarded in all three cases. After a recording was
+        started or replaced, the consumer therefore gets only events that are in the new recording.
 
         Args:
             log: the new recording; None to stop recording.

@@ -41,7 +41,8 @@ class FrameBatch:
     Attributes:
         interrupted: whether input was lost after these frames, so that no frame or scan extends
             into the next batch.
-        replaced: whether another sensor is read from now on, so that earlier frames are discarded.
+        replaced: whether this batch and all later batches are from another sensor than the batches
+            before. Frames of the earlier sensor that wait to be decoded are then discarded.
     """
 
     frames: list[Frames] = field(default_factory=list)

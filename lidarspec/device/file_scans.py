@@ -82,7 +82,7 @@ class FileScans(ClosingContext):
         return [*self._input.warnings, *self._added_warnings]
 
     def add_warnings(self, warnings: Iterable[str]) -> None:
-        """Add to `warnings`, for example warnings about the scans of the file."""
+        """Make the property `warnings` return these warnings as well."""
         self._added_warnings += warnings
 
     def __iter__(self) -> Iterator[Scan]:

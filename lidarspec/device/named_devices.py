@@ -133,11 +133,12 @@ class NamedDevice:
 
 
 def find_device(source: str | Path) -> NamedDevice | None:
-    """Return the device with the name `source`; None if there is no such device.
+    """Return the device with the name `source`; None for any other SOURCE.
 
     Raises:
-        UsageError: for a mistake in the settings file, or for a device that is not allowed. If
-            devices are declared, also if `source` is a word that is neither a name nor a file.
+        UsageError: if the settings file has a mistake, or if the device is not allowed; or if
+            devices are declared, but `source` is a plain word (not a URL or path) that names
+            neither a device nor a file.
         SourceError: if the settings file cannot be read.
     """
     word = str(source)

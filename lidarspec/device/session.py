@@ -337,7 +337,8 @@ class Session:
     Attributes:
         started: whether the sensor was started, and not stopped since.
         late: number of replies that arrived after their timeout.
-        unanswered: name of a heartbeat command that has no reply -> the error of its last sending.
+        unanswered: name of each heartbeat command that failed -> the error of its last failure. A
+            later reply removes the entry.
         host: the address of this computer as seen by the sensor; None if unknown.
         port: the port at which this computer expects the data; None if unknown.
         provided: name in `Command.provides` -> value from a reply.
