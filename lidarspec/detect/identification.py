@@ -100,7 +100,7 @@ def distinguish(candidates: Sequence[Sensor], frames: Mapping[str, Sequence[Foun
     """
     ids = {sensor.id for sensor in candidates}
     excluding = {
-        sensor.id: _find_sending_relatives(sensor, frames[sensor.id]) for sensor in candidates
+        sensor.id: _find_relatives_that_sent(sensor, frames[sensor.id]) for sensor in candidates
     }
     left = [sensor for sensor in candidates if not excluding[sensor.id]]
     reasons = {name: why for relatives in excluding.values() for name, why in relatives.items()}
@@ -148,13 +148,15 @@ def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
     return f"{sensor.reported['model'].paths[0]} is {names[0]}"
 
 
-def _find_sending_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
-    """Return the related models that must have sent the frames instead of a sensor.
+def _find_relatives_that_sent(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
+    """Return the models that must have sent the frames, instead of `sensor`.
 
-    More than half of the packets are then packets that only the related model sends.
+    A related model is returned if more than half of the packets are packets that only this model
+    sends, and `sensor` never sends.
 
     Returns:
-        Id of the related model -> its difference from the sensor.
+        Id of the related model -> its difference from the sensor; {} if the sensor itself may have
+        sent the frames.
     """
     distinct_relatives = {
         name: relative
@@ -489,7 +491,9 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
 
 
 def _read_stored_checksums(checksum: FrameChecksum, rows: Bytes2D) -> NDArray[np.uint64]:
-    """Return the checksums that frames contain, (n,), so that all checksums are accepted.
+    """Return the checksums that frames contain, (n,).
+
+    A decoder that uses this function instead of computing the checksums accepts every checksum.
 
     Args:
         checksum: the checksum as the struct of the frame declares it.
@@ -850,9 +854,10 @@ def _has_prefix(codec: Codec, data: bytes) -> bool:
 
 
 def _begins_like_frame(fault: WireError) -> bool:
-    """Return whether the bytes of an error resemble a frame, although they are invalid.
+    """Return whether the invalid bytes that caused an error begin like a frame.
 
-    They must have the constants of the frame type, with at least `MIN_CONSTANT_BITS` bits.
+    The bytes must have the constants at the start of the frame type, as far as the bytes reach, and
+    these constants must have at least `MIN_CONSTANT_BITS` bits.
     """
     if not fault.frame:
         return False
