@@ -351,8 +351,8 @@ def _check_reported(sensor: SensorDescription, name: str) -> None:
         if opening in sensor.commands
     ):
         raise SpecError(
-            "`reported` requires a command in `on_open` that provides the port, and is sent over"
-            " another link",
+            "`reported` requires that a command in `on_open` provides the port, and that this"
+            " command is sent over another link",
             path=f"links.{name}",
             sensor=sensor.id,
         )
@@ -465,7 +465,7 @@ def _check_command(sensor: SensorDescription, name: str, command: Command) -> No
     if command.needed and not any(other.provides for other in sensor.commands.values()):
         raise SpecError(
             f"the name {min(command.needed)!r} in a template is unknown: the command has no such"
-            " argument, and no command has `provides`",
+            " argument, and no command has a `provides` function that could return its value",
             path=f"commands.{name}.values",
             sensor=sensor.id,
         )

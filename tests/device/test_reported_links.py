@@ -268,14 +268,14 @@ def test_commands_over_the_data_link_are_broadcast_until_the_sensor_sends() -> N
         (lambda: Tcp(1, reported="port"), "Tcp requires a port"),
         (
             lambda: dataclasses.replace(SENSOR, links={**SENSOR.links, "data": Tcp(reported="a")}),
-            "`reported` requires a command in `on_open` that provides the port",
+            "`reported` requires that a command in `on_open` provides the port",
         ),
         (
             lambda: dataclasses.replace(
                 HANDLES,
                 commands={"start": dataclasses.replace(HANDLES.commands["start"], provides=None)},
             ),
-            "no command has `provides`",
+            "no command has a `provides` function",
         ),
         (
             lambda: dataclasses.replace(
