@@ -190,8 +190,8 @@ def convert(
     If OUT contains a number format, as in scans/%05d.pcd, each scan is written to a file of its
     own. With %F, %H, %M or %S in OUT, all scans of one date, hour, minute or second share a file.
 
-    With -f NAME, and for sensors without points, .csv, .parquet, .arrow, .feather and .mcap
-    contain the fields of frames, in physical units.
+    If -f selects a frame type, or if the sensor has no points, .csv, .parquet, .arrow, .feather and
+    .mcap contain the fields of frames, in physical units.
 
     .lsr, .pcap and .pcapng contain the packets as they were received.
 
@@ -200,9 +200,9 @@ def convert(
     lidarspec[arrow,las,e57,zarr,ros,foxglove,rerun].
 
     With --to, each IN is a file, a quoted pattern ('drives/**/*.pcap') or a URL
-    (s3://bucket/a.pcap), and OUT is a folder. OUT/manifest.jsonl lists the finished pieces. If the
-    command is repeated, it converts only the missing pieces. If a file fails, the others are still
-    converted.
+    (s3://bucket/a.pcap), and OUT is a folder. Large files are converted in pieces (--piece).
+    OUT/manifest.jsonl lists the finished pieces. If the command is repeated, it converts only the
+    missing pieces. If a file fails, the others are still converted.
     """
     chooses_scans = replace(selection, times=(None, None), time="sensor") != EVERYTHING
     properties = {
@@ -346,9 +346,9 @@ def _choose_frames(device: Device, target: str, frame: str | None) -> Sequence[s
     """Return the frame types to write.
 
     Args:
-        frame: the requested frame type, such as "report", or one kind of the parts (elements of
-            several kinds) in a field of a frame, such as "report.tags.temperature"; None for all
-            frame types that the sensor sends.
+        frame: the requested frame type, such as "report". If a field of the frame type contains
+            elements of several kinds, FRAME.FIELD.KIND requests the elements of one kind, such as
+            "report.tags.temperature". None for all frame types that the sensor sends.
     """
     sensor = device.sensor
     frames = sensor.incoming
@@ -522,7 +522,7 @@ def _write_points(
     note(f"{counts} of {device.sensor.id}; {device.stats}")
     if counts.units:
         columns = [f"{name} [{unit}]" if unit else name for name, unit in counts.units.items()]
-        note(f"{device.sensor.id} has further columns: {', '.join(columns)}")
+        note(f"{device.sensor.id} has columns that not every sensor has: {', '.join(columns)}")
     return {"scans": counts.scans, "points": counts.points, "units": dict(counts.units)}
 
 

@@ -321,12 +321,12 @@ class FrameSelection:
             raise suggest(fault, f"lidarspec show {self._sensor.id}") from None
 
     def report_outcome(self, sample: SampleBytes) -> None:
-        """Print the numbers of frames and other bytes, at the end of the input.
+        """Print the numbers of frames, and of bytes outside frames, that were counted.
 
         Raises:
             UsageError: if the input ends before the selected bytes.
             WireError: if the input contains no frame.
-            Exit: if `bad` is set and the input is damaged.
+            Exit: with exit code 1, if only damage was to be shown (`bad`) and some was found.
         """
         if self._ended and not self._shown and self._end <= self._from:
             raise UsageError(

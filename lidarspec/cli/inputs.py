@@ -218,7 +218,7 @@ def refuse_overwriting(
         if os.path.exists(file)
     ]
     files = [file for file in existing if os.path.isfile(file)]
-    for path in [path for source in inputs for path in _iter_read_files(source)] if files else ():
+    for path in [path for source in inputs for path in _iter_input_files(source)] if files else ():
         if os.path.exists(path):
             same = next((file for file in files if os.path.samefile(path, file)), None)
         else:
@@ -236,8 +236,11 @@ def refuse_overwriting(
         raise suggest(error, "repeat with --force, or with another file")
 
 
-def _iter_read_files(argument: str | Path | Sensor | None) -> Iterator[str | int]:
-    """Yield the possible names of an argument's files; descriptor 0 for standard input."""
+def _iter_input_files(argument: str | Path | Sensor | None) -> Iterator[str | int]:
+    """Yield the names of the files that a command may read for an argument.
+
+    Some of these files do not exist. For standard input, the descriptor 0 is yielded.
+    """
     if isinstance(argument, Sensor):
         yield from (
             str(value) for value in argument.options.values() if isinstance(value, str | Path)

@@ -380,10 +380,11 @@ def stats(
 ) -> None:
     """Print scan rate, packet rate, errors, loss, jitter and queue of a sensor.
 
-    A line is printed for each interval, and a summary at the end. Speed is the number of scans per
-    second. Queue is the number of reads or datagrams that wait to be decoded. Errors are frames
-    with a wrong checksum, length or value. Loss is the share of missing packets, computed from the
-    packet counter or the clock of the sensor. A file is read as fast as possible, in batches. Its
+    A line is printed for each interval, and a summary at the end. The column "speed" contains the
+    scan rate. Jitter is the standard deviation of the time from one packet to the next. Queue is
+    the number of reads or datagrams that wait to be decoded. Errors are frames with a wrong
+    checksum, length or value. Loss is the share of missing packets, computed from the packet
+    counter or the clock of the sensor. A file is read as fast as possible, in batches. Its
     intervals are measured by packet time, and can be longer than requested. Several sources are
     read one after another.
     """

@@ -235,7 +235,10 @@ def _list_plan(sensor: Sensor, frame: str) -> list[str]:
     sent = pack_found([Found(frame, 0, data) for data in frames])
     packets = PacketStream(sensor, frame, Counters()).add([sent]).with_points
     if not isinstance(packets.table, CompiledTable) or not packets.table.groups:
-        return ["reference evaluator: the example frame has no points, so there is no faster plan"]
+        return [
+            "reference evaluator: a faster method requires that the struct can be compiled, and"
+            " that the example frame has points"
+        ]
     largest = max(packets.table.groups, key=lambda group: group.layout.size)
     plan = plan_for(sensor.points_of(packets.frame), packets.batch(), largest)
     if isinstance(plan, Plan):

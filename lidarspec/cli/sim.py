@@ -139,8 +139,9 @@ PLACES = (
     "--clock",
     metavar="FAULT,...",
     help="Time scale of the clock (utc, tai or gps) and faults to simulate, separated by commas:"
-    " drift=50ppm, step=0.2s@10s, pps@10s, leap@10s, unlock=5s@10s, restart@10s. @10s means 10 s"
-    " after power-on.",
+    " drift=50ppm (the clock is fast), step=0.2s@10s (it jumps forward), pps@10s (it counts a pulse"
+    " twice), leap@10s (it repeats a second), unlock=5s@10s (it is not locked for 5 s), restart@10s"
+    " (it starts again as after power-on). @10s means 10 s after power-on.",
 )
 @click.option("--rotor", type=click.Choice([BLOCKED]), help="Simulate a blocked rotor.")
 @click.option("--force", is_flag=True, help="Overwrite an existing file.")
