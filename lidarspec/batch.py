@@ -159,9 +159,9 @@ class FilePiece:
         return self.make_record(error=reason)
 
     def iter_numbered(self, scans: FileScans) -> Iterator[Scan]:
-        """Yield the scans of the piece that `select` selects.
+        """Yield the selected scans of the piece.
 
-        The number of a scan counts from the start of the file.
+        `Scan.number` of each scan is its number in the whole file, from 0.
 
         Args:
             scans: the reader that `open_scans` has returned.

@@ -28,7 +28,11 @@ _FOLDERS = (".dist-info", ".egg-info")
 
 
 class _SearchNeededError(Exception):
-    """Distributions may be outside folders, so `importlib.metadata` has to find them."""
+    """Only `importlib.metadata` can find all distributions.
+
+    Raised if `sys.path` contains an egg or a file (such as a zip file), or if `sys.meta_path`
+    contains a further finder of distributions.
+    """
 
 
 class EntryPoint(NamedTuple):

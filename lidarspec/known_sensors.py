@@ -102,8 +102,8 @@ def known_sensors() -> tuple[KnownSensor, ...]:
 def select_known_sensors(entries: Iterable[EntryPoint]) -> list[KnownSensor]:
     """Return the rows of the table that describe installed sensors.
 
-    A row is returned if its distribution is installed in the same version, and if the entry points
-    of a sensor are exactly the id and the aliases in the row.
+    A row is returned if its distribution is installed in the version of the row, and if the entry
+    points of this distribution for one sensor are exactly the id and the aliases in the row.
 
     Args:
         entries: the entry points of all installed sensors.

@@ -702,7 +702,7 @@ def _import_in_time(entry: EntryPoint) -> Any:
     if thread.is_alive():
         warnings.warn(
             f"{entry.distribution}: {entry.module} has been loading for {LOAD_WARNING_S:g} s; if it"
-            " hangs, lidarspec plugins shows where",
+            " hangs, run `lidarspec plugins` to see where",
             stacklevel=2,
         )
         thread.join(max(LOAD_TIMEOUT_S - LOAD_WARNING_S, 0))

@@ -499,8 +499,8 @@ def test_a_plugin_that_takes_long_is_named_while_it_does(
         monkeypatch.setattr(warnings, "showwarning", tell)
         Registry([EntryPoint("slow", "slow_lidars", "slow-lidars", "1")])
     assert told == [
-        "slow-lidars: slow_lidars has been loading for 0.01 s; if it hangs, lidarspec plugins shows"
-        " where"
+        "slow-lidars: slow_lidars has been loading for 0.01 s; if it hangs, run `lidarspec plugins`"
+        " to see where"
     ]
 
 
