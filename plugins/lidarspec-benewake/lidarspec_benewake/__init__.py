@@ -101,12 +101,12 @@ def make_message(size: int, *fields: Any, out: bool = False) -> Frame:
     return Frame(
         Checksummed(struct, field="checksum", algorithm=Sum(8)),
         direction="out" if out else "in",
-        plausible=None if out or size > 5 else is_known_reply,
+        plausible=None if out or size > 5 else is_single_byte_reply,
     )
 
 
-def is_known_reply(f: Fields) -> Any:
-    """Return whether the id is one of the ids for which the reply contains a single byte."""
+def is_single_byte_reply(f: Fields) -> Any:
+    """Return whether the id is that of a reply with a content of one byte."""
     return (
         (f.id == RESET) | (f.id == FORMAT) | (f.id == OUTPUT) | (f.id == FACTORY) | (f.id == SAVE)
     )

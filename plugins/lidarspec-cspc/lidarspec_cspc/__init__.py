@@ -384,10 +384,10 @@ def older_sweep(i: int) -> dict[str, float]:
 
 
 def make_request(mode: str, **more: Any) -> Command:
-    """Return a command that the sensor acknowledges with the mode of the command.
+    """Return a command that sets a mode, and waits for the acknowledgement of this mode.
 
-    The name of the mode is the same in the command and in the acknowledgement; the byte of the
-    acknowledgement is that of the command, XORed with A0.
+    The byte of the mode in the acknowledgement is the byte in the command, XORed with A0. Both
+    bytes are decoded to the same name.
     """
     return Command(
         "command", {"mode": mode}, reply="ack", matches={"mode": mode}, retries=1, **more
@@ -420,10 +420,11 @@ def has_customer_firmware(f: Fields) -> Any:
 
 
 def contradicts_firmware(f: Fields) -> Any:
-    """Return whether `mt.m` of a packet is neither 0 nor the scan rate nor the customer firmware.
+    """Return whether a CSPC sensor cannot have sent the value `mt.m` of a packet.
 
-    The customer firmware is in the packets that directly follow a start packet. The result for the
-    first packet is False, because the packet before it is unknown.
+    `mt.m` is the scan rate in a start packet, the customer firmware or 0 in the packet directly
+    after a start packet, and 0 in every other packet. The result for the first packet is False,
+    because the packet before it is unknown.
     """
     begins = np.asarray(f.mt.start == 1)
     values = np.asarray(f.mt.m)

@@ -107,26 +107,27 @@ class Mirror(Calibration):
     azimuth_adjust: Table | None = None
     elevation_adjust: Table | None = None
 
-    def with_file(self, path: str | Path | Learned) -> Mirror:
+    def with_file(self, source: str | Path | Learned) -> Mirror:
         """Return a copy with the angles of one unit.
 
         Args:
-            path: the unit's correction file (.dat), or its reply to the command `get_calibration`.
+            source: the path of the unit's correction file (.dat), or the unit's reply to the
+                command `get_calibration`.
 
         Raises:
             UsageError: if the file cannot be read, or belongs to another model.
         """
-        data = read_content(path)
+        data = read_content(source)
         try:
             file = FILE.parse(data)
         except ConstructError as error:
             raise UsageError(
-                f"{path!s}: not a correction file of an AT128, version 1.5 (.dat):"
+                f"{source!s}: not a correction file of an AT128, version 1.5 (.dat):"
                 f" {str(error).splitlines()[-1]}"
             ) from None
         if not file.faces or hashlib.sha256(data[:-32]).digest() != data[-32:]:
             raise UsageError(
-                f"{path!s}: the correction file is corrupt: its SHA-256 does not match"
+                f"{source!s}: the correction file is corrupt: its SHA-256 does not match"
             )
         step_deg = file.resolution / AZIMUTH_STEPS_PER_DEG
         return dataclasses.replace(

@@ -75,17 +75,20 @@ class Calibration:
     def __len__(self) -> int:
         return len(self.elevation)
 
-    def with_file(self, path: str | Path | Learned) -> Calibration:
+    def with_file(self, source: str | Path | Learned) -> Calibration:
         """Return a copy with the angles of one unit.
 
         Args:
-            path: the unit's correction file, or its reply to the command `get_calibration`.
+            source: the path of the unit's correction file, or the unit's reply to the command
+                `get_calibration`.
 
         Raises:
             UsageError: if the file cannot be read, or belongs to another model. The error has the
                 line and column.
         """
-        elevation, azimuth = read_columns(path, {ELEVATION: self.elevation, AZIMUTH: self.azimuth})
+        elevation, azimuth = read_columns(
+            source, {ELEVATION: self.elevation, AZIMUTH: self.azimuth}
+        )
         return dataclasses.replace(self, elevation=elevation, azimuth=azimuth, nominal=False)
 
     def to_file(self) -> bytes:

@@ -122,8 +122,9 @@ def row_similarity(columns: Bytes2D, profile: str, rows: int) -> float:
 
     Returns:
         -1 if unused bits are set in many pixels, which means that the layout is probably wrong.
-        Otherwise a number from 0 to 1: each of four groups contains every fourth row, and the
-        smallest mean range of a group is divided by the largest mean range of a group.
+        Otherwise a number from 0 to 1. The rows are divided into four groups of every fourth row,
+        so that adjacent rows are in different groups. The number is the smallest mean range of a
+        group, divided by the largest.
     """
     start = 16 if profile == "LEGACY" else 12
     bits = PROFILES[profile]

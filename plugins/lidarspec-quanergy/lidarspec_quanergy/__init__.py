@@ -3,8 +3,8 @@
 Numbers are big-endian. Source: the vendor's quanergy_client (packet_header.h,
 m_series_data_packet.h, data_packet_parser_00.cpp, data_packet_parser_04.cpp,
 data_packet_parser_m_series.h). In the client, the time of a packet is the time of its last firing.
-Three things are assumed: the firings are evenly spaced and measure 420,000 points a second, the
-range limits, and the revolutions per second. The positions of the firings increase or decrease,
+Three things are assumed: evenly spaced firings with 420,000 points a second in total, the range
+limits, and the number of revolutions per second. The positions of the firings increase or decrease,
 depending on the direction of rotation. In packets before version 4, the field `nanoseconds` counts
 steps of 10 ns. This module always reads steps of 1 ns, so the times of these packets are wrong.
 Packets of kind 0 (three returns) and kind 4 (one return) are supported; kinds 1 and 6 and settings

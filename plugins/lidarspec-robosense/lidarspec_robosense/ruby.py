@@ -155,11 +155,14 @@ def firing_times(times: Any, counts: Any) -> NDArray[np.float64]:
 
 
 def even_firing_times(*counts: int) -> NDArray[np.float64]:
-    """Return the firing times of lasers in seconds, if the times are evenly spaced.
+    """Return the firing time of each laser in seconds, for evenly spaced firing times.
 
     The lasers form two groups. Both groups fire at the same 16 times, which are 3.236 us apart.
-    `counts` has the number of lasers that fire at each time: 16 numbers for the first group, then
-    16 for the second group. Source: rs_driver.
+    Source: rs_driver.
+
+    Args:
+        counts: the number of lasers that fire at each time: 16 numbers for the first group, then 16
+            numbers for the second group.
     """
     return firing_times(np.tile(np.arange(16) * 3.236, 2), counts)
 

@@ -342,7 +342,7 @@ class LidarNode(LifecycleNode):
                 if not self.has_parameter(f"{name}.{argument}"):
                     text = (
                         f"Argument of the service {name}. A number without a unit is in the unit"
-                        " of this argument."
+                        f" that `lidarspec show {device.sensor.id}` prints for the argument."
                     )
                     self.declare_parameter(
                         f"{name}.{argument}",

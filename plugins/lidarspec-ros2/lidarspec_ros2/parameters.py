@@ -259,7 +259,7 @@ class Settings:
         )
 
     def make_planar_scans(self) -> PlanarScans:
-        """Return the projection to planar scans that the parameters describe."""
+        """Return the projection of clouds to planar scans, as set by the parameters."""
         first = self["angle_min"]
         width = (self["angle_max"] - self["angle_min"]) % (2 * math.pi)
         low = self["scan_z_min"]

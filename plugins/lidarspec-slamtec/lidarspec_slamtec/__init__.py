@@ -2,7 +2,8 @@
 
 Source: RPLIDAR interface protocol and the vendor's SDK (sl_lidar_cmd.h, handler_capsules.cpp,
 sl_lidar_driver.cpp); baud rates and ports from the SDK (_getNativeBaudRate) and the launch files of
-sllidar_ros2, ranges from the models' data sheets if `source` names them.
+sllidar_ros2. The attribute `source` of each sensor names the source of its range, or says that the
+range is assumed.
 
 A data frame is a node, which is one point, or a capsule, which has many points. A response
 descriptor announces the kind of the following data frames, and the decoder searches for frames of a

@@ -1,7 +1,8 @@
 """Capsules, which contain many distances and the angle of the first point.
 
-A cabin, as the SDK calls it, is a group of one, two or three points that are encoded together. A
-capsule has 32 or 40 cabins, an express capsule 16.
+A cabin, as the SDK calls it, is a group of points that are encoded together. An express capsule has
+16 cabins of two points, an ultra capsule 32 cabins of three points, a dense capsule 40 cabins of
+one point, and an ultra-dense capsule 32 cabins of two points.
 
 The angles of the other points are computed with the start angle of the next capsule: point k of N
 is at ``start + (next start - start) * k / N``, minus a compensation. The points of a capsule have
@@ -118,14 +119,15 @@ ULTRA = make_capsule(
                 "predict2"
                 / Scaled(BitsInteger(10, signed=True), 1, "")
                 * (
-                    "the distance minus the distance `major` of the next cabin, in steps that"
-                    " depend on `major` of the next cabin; 511 and -512: no return"
+                    "the distance of the third point minus the distance `major` of the next cabin,"
+                    " in steps that depend on this `major`; 511 and -512: no return"
                 ),
                 "predict1"
                 / BitsInteger(10, signed=True)
-                * "the distance minus the distance `major` of this cabin, in steps that depend on"
-                " `major`; 511 and -512: no return",
-                "major" / BitsInteger(12) * "0: no return",
+                * "the distance of the second point minus the distance `major` of this cabin (of"
+                " the next cabin if `major` is 0), in steps that depend on the same `major`; 511"
+                " and -512: no return",
+                "major" / BitsInteger(12) * "the encoded distance of the first point; 0: no return",
             )
         ),
     ),

@@ -96,7 +96,10 @@ HQ = Checksummed(
 
 
 def plausible(f: Fields) -> Any:
-    """Return whether a node is valid: its bits `start` and `inverse`, and its angle."""
+    """Return whether the bits `start` and `inverse` differ, and the angle is valid.
+
+    The angle must be below 360 degrees. The check bit is a constant of the struct.
+    """
     return (f.head.start != f.head.inverse) & (f.beam.angle < 360)
 
 

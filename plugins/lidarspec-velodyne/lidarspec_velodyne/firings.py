@@ -43,8 +43,8 @@ class FiringPattern:
     Attributes:
         elevation: degrees, (32,), for the laser of each slot of a block; (blocks, 32) if the blocks
             contain different lasers.
-        delay: the time in seconds at which the laser of each slot fires, counted from the first
-            firing of the blocks with this azimuth, in the shape of `elevation`.
+        delay: seconds from the first firing at the azimuth of a block to the firing of the laser of
+            each slot, in the shape of `elevation`. Several blocks can have the same azimuth.
         period: seconds from one azimuth to the next.
         focal_distance: metres. The beams leave the lens at different heights, and cross at this
             distance.

@@ -66,8 +66,8 @@ class Guard:
     Args:
         host: address on which the server listens.
         link_host: the host in the printed link.
-        on_token: called for each request that has the token, with the client's address and port;
-            None if they are unknown.
+        on_token: a function that is called for each request that has the token. Its argument is the
+            client's (address, port), or None if they are unknown.
     """
 
     def __init__(

@@ -76,7 +76,8 @@ class PageMessages:
         Args:
             frozen: whether the page has paused its own view of a live source.
             first_damaged: the number of the first `DamagedBytes` that the page does not have yet.
-            paused_at: the scan at which the page is paused; None for the newest scan.
+            paused_at: the scan that the page shows if `frozen` is True; None if the page shows the
+                newest scan.
         """
         broadcast = self.broadcast
         switch = broadcast.switch
@@ -143,7 +144,9 @@ class PageMessages:
     def find_point_frame(
         self, shown: ShownScan | None, number: int, index: int, backlog: RecentBytes
     ) -> dict[str, Any]:
-        """Return the explained frame of a point, and the path of the point's row.
+        """Return the explained frame that contains a point.
+
+        The entry `value` of the result is the path of the point's row in the explanation.
 
         Args:
             shown: the scan of the point; None if the scan is no longer stored.

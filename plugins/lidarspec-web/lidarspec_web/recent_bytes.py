@@ -65,11 +65,11 @@ class DamagedBytes:
 
 @dataclass(frozen=True)
 class StoredFrame:
-    """A frame that a page can explain.
+    """The bytes of a frame that a page can explain.
 
     Attributes:
-        number: number of the frame, counted from 0; None if `RecentBytes` no longer has the frame,
-            so that the bytes are from the scan of a point.
+        number: number of the frame, counted from 0; None if `RecentBytes` no longer has the frame.
+            Its bytes were then taken from the scan that contains the requested point.
         at: arrival time, ns since 1970; -1 if it is unknown.
     """
 

@@ -42,7 +42,8 @@ def make_scan_message(
         number: number of the scan; the page uses it to request the frame of a point.
         position: the time of the scan, in seconds after the first scan of the source.
         arrival: the arrival time of the scan's last packet, in seconds since 1970 by this
-            computer's clock; the message contains this time as `sent`.
+            computer's clock. The message contains this time under the key `sent`, from which the
+            page calculates how old the scan is.
         max_points: maximum number of points. If there are more points, evenly distributed points
             are selected.
     """

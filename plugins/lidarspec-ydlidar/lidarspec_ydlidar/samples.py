@@ -27,8 +27,9 @@ class SampleFormat:
         groups: the sizes in bytes of the words into which the checksum divides a sample.
         correction: a function of the distance in metres that returns the degrees to add to the
             angle.
-        lowest_frequency_hz: the scan frequency in Hz to which the raw value is added. It is the
-            value of the raw value 0, which also means that the frequency is unknown.
+        lowest_frequency_hz: the offset of the scan frequency in Hz. The frequency is this offset
+            plus 0.1 Hz times the raw value. The raw value 0 is decoded as the offset, but means
+            that the frequency is unknown.
     """
 
     struct: Construct
