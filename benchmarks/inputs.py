@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 import lidarspec as ls
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import Datagram, datagram_record
-from lidarspec.captures.records import capture_head
+from lidarspec.captures.pcap import Datagram, make_datagram_record
+from lidarspec.captures.records import make_capture_head
 from lidarspec.simulation.simulator import make_opening_frame, simulate
 
 #: sensor, frames of a full run, options of the sensor.
@@ -129,10 +129,10 @@ class Inputs:
         sender = ("192.168.1.200", 6699)
         receiver = ("192.168.1.102", 6699)
         with path.open("wb") as file:
-            file.write(capture_head(ETHERNET))
+            file.write(make_capture_head(ETHERNET))
             for index, frame in enumerate(self.frames(key)):
                 file.write(
-                    datagram_record(
+                    make_datagram_record(
                         Datagram(frame, 1_700_000_000 * 10**9 + index * 158_730, sender, receiver)
                     )
                 )

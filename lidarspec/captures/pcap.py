@@ -34,8 +34,8 @@ from lidarspec.captures.records import (
     Form,
     NoPacketReason,
     is_capture,
+    make_packet_record,
     make_record_reader,
-    packet_record,
     seek_time,
     skip_damage,
 )
@@ -293,16 +293,16 @@ class StreamReader(CaptureReader):
         return Datagram(packet.data, packet.at, UNKNOWN_ENDPOINT, UNKNOWN_ENDPOINT, headers)
 
 
-def datagram_record(datagram: Datagram) -> bytes:
+def make_datagram_record(datagram: Datagram) -> bytes:
     """Make the pcap record that contains a datagram.
 
     Raises:
         UsageError: if the payload is too long, or an address, port or time is invalid.
     """
-    return packet_record(datagram_frame(datagram), datagram.at)
+    return make_packet_record(make_datagram_frame(datagram), datagram.at)
 
 
-def datagram_frame(datagram: Datagram) -> bytes:
+def make_datagram_frame(datagram: Datagram) -> bytes:
     """Make an unfragmented Ethernet frame that contains a datagram.
 
     Raises:

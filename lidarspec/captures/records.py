@@ -556,7 +556,7 @@ def _parse_packet_block(
     return CapturedPacket(interface.link, at, body[20 : 20 + captured], original)
 
 
-def capture_head(link: int) -> bytes:
+def make_capture_head(link: int) -> bytes:
     """Make the header of a little-endian pcap file with nanoseconds.
 
     Args:
@@ -565,7 +565,7 @@ def capture_head(link: int) -> bytes:
     return _HEAD.pack(NANOSECOND_MAGIC, 2, 4, 0, 0, MAX_PACKET_BYTES, link)
 
 
-def packet_record(data: bytes, at: int) -> bytes:
+def make_packet_record(data: bytes, at: int) -> bytes:
     """Make the pcap record that contains a packet.
 
     Args:
@@ -636,7 +636,7 @@ def _make_block(kind: int, body: bytes) -> bytes:
 
 #: The functions that write captures of a format, by the suffix of the file.
 WRITINGS = {
-    ".pcap": CaptureFormat(capture_head, packet_record, record_size),
+    ".pcap": CaptureFormat(make_capture_head, make_packet_record, record_size),
     ".pcapng": CaptureFormat(
         _make_pcapng_head,
         _make_pcapng_record,

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from lidarspec._version import __version__
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import UNKNOWN_ENDPOINT, USER_LINKS, Datagram, datagram_frame
+from lidarspec.captures.pcap import UNKNOWN_ENDPOINT, USER_LINKS, Datagram, make_datagram_frame
 from lidarspec.captures.records import WRITINGS
 from lidarspec.errors import UnknownFormat, UsageError
 from lidarspec.framing.decoder import Decoder
@@ -175,7 +175,9 @@ class PcapRecorder(BackgroundWriter):
                 chunk.sender or UNKNOWN_ENDPOINT,
                 chunk.receiver or self._receiver,
             )
-            self._put(self._writing.record(datagram_frame(datagram), datagram.at), len(chunk.data))
+            self._put(
+                self._writing.record(make_datagram_frame(datagram), datagram.at), len(chunk.data)
+            )
 
 
 class FrameRecorder(BackgroundWriter):

@@ -30,9 +30,9 @@ from lidarspec.captures.pcap import (
     CaptureReader,
     Datagram,
     StreamReader,
-    datagram_record,
+    make_datagram_record,
 )
-from lidarspec.captures.records import capture_head
+from lidarspec.captures.records import make_capture_head
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.files import CaptureTransport, open_file
 from tests import made_captures as made
@@ -457,10 +457,10 @@ def test_one_sender_of_several(tmp_path: Path) -> None:
 def test_frames_of_two_senders_are_not_mixed(other: tuple[str, int], tmp_path: Path) -> None:
     path = tmp_path / "two.pcap"
     with path.open("wb") as file:
-        file.write(capture_head(ETHERNET))
+        file.write(make_capture_head(ETHERNET))
         for index, data in enumerate(simulate(ls.sensor("robosense-m1"), 40)):
             file.write(
-                datagram_record(
+                make_datagram_record(
                     Datagram(
                         data, index, other if index % 2 else ("10.0.0.1", 6699), made.DESTINATION
                     )
@@ -482,9 +482,10 @@ def test_a_calibration_of_another_address_is_not_mixed_in(tmp_path: Path) -> Non
         (sensor.build("info", elevation=[1, 2, 3]), "10.0.0.2"),
     ]
     data = [
-        datagram_record(Datagram(frame, 0, (host, 7001), made.DESTINATION)) for frame, host in sent
+        make_datagram_record(Datagram(frame, 0, (host, 7001), made.DESTINATION))
+        for frame, host in sent
     ]
-    path.write_bytes(capture_head(ETHERNET) + b"".join(data))
+    path.write_bytes(make_capture_head(ETHERNET) + b"".join(data))
     with (
         ls.open(path, sensor) as device,
         pytest.raises(ls.UsageError, match=r"10\.0\.0\.1 and 10\.0\.0\.2 both send frames"),

@@ -11,8 +11,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import Datagram, datagram_record
-from lidarspec.captures.records import capture_head
+from lidarspec.captures.pcap import Datagram, make_datagram_record
+from lidarspec.captures.records import make_capture_head
 from lidarspec.simulation.simulator import simulate
 
 SENSOR = "robosense-m1"
@@ -39,9 +39,9 @@ def write_repeated_capture(path: Path, megabytes: int) -> int:
     """Write a capture that repeats the same frames; return the number of packets."""
     frames = simulate(ls.sensor(SENSOR), 630)
     with path.open("wb") as file:
-        file.write(capture_head(ETHERNET))
+        file.write(make_capture_head(ETHERNET))
         for index, frame in enumerate(frames):
-            file.write(datagram_record(Datagram(frame, 10**18 + index * 158_730, *ENDS)))
+            file.write(make_datagram_record(Datagram(frame, 10**18 + index * 158_730, *ENDS)))
     data = path.read_bytes()
     times = max((megabytes << 20) // len(data), 1)
     with path.open("ab") as file:

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import CaptureReader, CaptureStats, Datagram, datagram_record
-from lidarspec.captures.records import capture_head
+from lidarspec.captures.pcap import CaptureReader, CaptureStats, Datagram, make_datagram_record
+from lidarspec.captures.records import make_capture_head
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.recorders import open_recorder
 from lidarspec.spec import Chunk
@@ -26,7 +26,7 @@ def chunk(datagram: Datagram) -> Chunk:
 
 
 def test_writer_bytes() -> None:
-    assert (capture_head(ETHERNET) + datagram_record(DATAGRAM)).hex(" ") == (
+    assert (make_capture_head(ETHERNET) + make_datagram_record(DATAGRAM)).hex(" ") == (
         # pcap header
         "4d 3c b2 a1 02 00 04 00 00 00 00 00 00 00 00 00 00 00 04 00 01 00 00 00 "
         # time 1700000000 s, 123456789 ns; 45 bytes
@@ -48,11 +48,11 @@ def test_written_datagrams_come_back_with_right_checksums() -> None:
         written.append(
             Datagram(draw.randbytes(size), draw.randrange(10**9 << 32), source, destination)
         )
-    records = list(map(datagram_record, written))
+    records = list(map(make_datagram_record, written))
     for record in records:
         total = sum(struct.unpack_from(">10H", record, 16 + 14))
         assert (total & 0xFFFF) + (total >> 16) == 0xFFFF
-    assert made.read(capture_head(ETHERNET) + b"".join(records)) == (
+    assert made.read(make_capture_head(ETHERNET) + b"".join(records)) == (
         written,
         CaptureStats(packets=len(written), datagrams=len(written)),
     )
@@ -69,8 +69,8 @@ def test_ipv6_is_written_with_its_checksum() -> None:
         *some,
     ]:
         datagram = Datagram(draw.randbytes(size), 10**18, ("fe80::1:2", 2368), (destination, 6699))
-        record = datagram_record(datagram)
-        ((read,), _) = made.read(capture_head(ETHERNET) + record)
+        record = make_datagram_record(datagram)
+        ((read,), _) = made.read(make_capture_head(ETHERNET) + record)
         assert (read.data, read.at, read.source, read.destination[1]) == (
             datagram.data,
             datagram.at,
@@ -154,6 +154,6 @@ def test_real_capture_written_again_reads_the_same() -> None:
         pytest.skip(f"no capture {path.name} in {made.CAPTURES} (set LIDARSPEC_CAPTURES)")
     datagrams = list(CaptureReader(path))
     assert (
-        made.read(capture_head(ETHERNET) + b"".join(map(datagram_record, datagrams)))[0]
+        made.read(make_capture_head(ETHERNET) + b"".join(map(make_datagram_record, datagrams)))[0]
         == datagrams
     )

@@ -14,7 +14,7 @@ import lidarspec as ls
 import lidarspec.captures.records
 from lidarspec.captures.bulk import CaptureBatches
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import UNKNOWN_ENDPOINT, Datagram, StreamReader, datagram_frame
+from lidarspec.captures.pcap import UNKNOWN_ENDPOINT, Datagram, StreamReader, make_datagram_frame
 from lidarspec.captures.records import WRITINGS
 from lidarspec.explaining import file_contents as contents
 from lidarspec.scans import selection
@@ -51,7 +51,7 @@ def write_records(
         file.write(writing.head(link) if head else b"")
         for count in range(first, first + number):
             data = count.to_bytes(4, "big") * 250
-            packet = datagram_frame(replace(SENT, data=data)) if link == ETHERNET else data
+            packet = make_datagram_frame(replace(SENT, data=data)) if link == ETHERNET else data
             file.write(writing.record(packet, START + count * STEP))
     return path
 
@@ -119,7 +119,7 @@ def test_damage_that_was_passed_over_is_not_counted(tmp_path: Path) -> None:
     path = write_records(tmp_path / "drive.pcapng")
     data, size = (
         bytearray(path.read_bytes()),
-        len(WRITINGS[".pcapng"].record(datagram_frame(SENT), START)),
+        len(WRITINGS[".pcapng"].record(make_datagram_frame(SENT), START)),
     )
     place = len(WRITINGS[".pcapng"].head(ETHERNET)) + 50 * size
     data[place + 4 : place + 8] = (2 * size).to_bytes(4, "little")  # a block as long as two
@@ -146,7 +146,7 @@ def test_no_seek_with_other_time_bases(tmp_path: Path) -> None:
     """The interface of the second section has another clock than the first."""
     path = write_records(tmp_path / "drive.pcapng", number=NUMBER * 2 // 3)
     ticks = made.interface(options=made.option(9, bytes([6])))
-    packet = datagram_frame(SENT)
+    packet = make_datagram_frame(SENT)
     end = START + NUMBER * STEP
     path.write_bytes(
         path.read_bytes()
@@ -190,7 +190,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with path.open("wb") as file:
         file.write(WRITINGS[".pcap"].head(ETHERNET))
         for number, data in enumerate(ls.simulate(ls.sensor("velodyne-vlp16"), 4 * RATE)):
-            frame = datagram_frame(replace(SENT, data=data))
+            frame = make_datagram_frame(replace(SENT, data=data))
             file.write(WRITINGS[".pcap"].record(frame, START + number * 1_000_000_000 // RATE))
     return path
 

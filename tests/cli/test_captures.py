@@ -14,8 +14,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import Datagram, datagram_record
-from lidarspec.captures.records import capture_head
+from lidarspec.captures.pcap import Datagram, make_datagram_record
+from lidarspec.captures.records import make_capture_head
 from lidarspec.recording.format import Record, Recording
 from lidarspec.simulation.simulator import simulate
 from tests import made_captures as made
@@ -29,7 +29,7 @@ def records(number: int, *sources: tuple[str, int]) -> list[bytes]:
     packets = simulate(ls.sensor(M1), number)
     ends = sources or (made.SOURCE,)
     return [
-        datagram_record(
+        make_datagram_record(
             Datagram(data, 10**18 + index * 158_730, ends[index % len(ends)], made.DESTINATION)
         )
         for index, data in enumerate(packets)
@@ -37,7 +37,7 @@ def records(number: int, *sources: tuple[str, int]) -> list[bytes]:
 
 
 def capture(path: Path, *records: bytes, link: int = ETHERNET) -> Path:
-    path.write_bytes(capture_head(link) + b"".join(records))
+    path.write_bytes(make_capture_head(link) + b"".join(records))
     return path
 
 
@@ -189,7 +189,7 @@ def test_senders_of_one_address_are_separated_by_port(tmp_path: Path) -> None:
 def test_a_sensor_that_sends_from_several_ports_to_several_is_one_sender(tmp_path: Path) -> None:
     data = records(20, ("10.0.0.1", 6699))
     status = [
-        datagram_record(Datagram(b"status", 10**18, ("10.0.0.1", 7788), ("10.0.0.2", 7788)))
+        make_datagram_record(Datagram(b"status", 10**18, ("10.0.0.1", 7788), ("10.0.0.2", 7788)))
         for _ in range(20)
     ]
     path = capture(

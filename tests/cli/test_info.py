@@ -9,8 +9,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import Datagram, datagram_record
-from lidarspec.captures.records import capture_head
+from lidarspec.captures.pcap import Datagram, make_datagram_record
+from lidarspec.captures.records import make_capture_head
 from lidarspec.explaining import file_contents as looking
 from lidarspec.recording.recorders import Recorder
 from lidarspec.simulation.simulator import simulate
@@ -36,7 +36,7 @@ def test_a_capture_of_two_sensors_with_one_lost_packet(frames: list[bytes], tmp_
         for number, data in enumerate(frames)
         for sender in senders[: 1 + (number < 200)]
     ]
-    path.write_bytes(capture_head(ETHERNET) + b"".join(map(datagram_record, datagrams)))
+    path.write_bytes(make_capture_head(ETHERNET) + b"".join(map(make_datagram_record, datagrams)))
     told = run_json("info", path)
     assert (told["kind"], told["size"], told["whole"]) == ("a capture", os.path.getsize(path), True)
     assert (told["packets"], told["bytes"], told["first_ns"]) == (499, 499 * 1206, START)

@@ -15,8 +15,8 @@ import lidarspec as ls
 import lidarspec.captures.bulk
 import lidarspec.device.device_input
 import lidarspec.transports.files
-from lidarspec.captures.pcap import USER_LINKS, Datagram, datagram_record
-from lidarspec.captures.records import capture_head, packet_record
+from lidarspec.captures.pcap import USER_LINKS, Datagram, make_datagram_record
+from lidarspec.captures.records import make_capture_head, make_packet_record
 from lidarspec.device.file_scans import FileScans
 from lidarspec.errors import UsageError
 from lidarspec.packets.reorder import WINDOW
@@ -83,11 +83,11 @@ def write_frames(sensor: ls.Sensor, path: Path, *, most: int = 120_000, longest:
     if sensor.datagrams or path.suffix == ".pcap":
         times = itertools.count(1_700_000_000 * 10**9, 1_000_000)
         record = (
-            (lambda frame, at: datagram_record(Datagram(frame, at, SOURCE, DESTINATION)))
+            (lambda frame, at: make_datagram_record(Datagram(frame, at, SOURCE, DESTINATION)))
             if sensor.datagrams
-            else packet_record
+            else make_packet_record
         )
-        head = pcap_head() if sensor.datagrams else capture_head(USER_LINKS[0])
+        head = pcap_head() if sensor.datagrams else make_capture_head(USER_LINKS[0])
         path.write_bytes(head + b"".join(map(record, frames, times)))
     else:
         path.write_bytes(

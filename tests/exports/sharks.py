@@ -12,8 +12,8 @@ import pytest
 
 from lidarspec import Sensor
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import USER_LINKS, Datagram, datagram_record
-from lidarspec.captures.records import capture_head, packet_record
+from lidarspec.captures.pcap import USER_LINKS, Datagram, make_datagram_record
+from lidarspec.captures.records import make_capture_head, make_packet_record
 from lidarspec.exports import export
 from lidarspec.spec import Udp
 
@@ -80,17 +80,17 @@ def write_capture(sensor: Sensor, frames: Iterable[bytes], path: Path) -> Path:
     """Write a capture of these frames, one a packet, for the sensor's data link."""
     link = sensor.links["data"]
     with path.open("wb") as file:
-        file.write(capture_head(ETHERNET if sensor.datagrams else USER_LINKS[0]))
+        file.write(make_capture_head(ETHERNET if sensor.datagrams else USER_LINKS[0]))
         for number, frame in enumerate(frames):
             if isinstance(link, Udp) and sensor.datagrams:
                 port = link.ports[0] if link.ports else 9
                 file.write(
-                    datagram_record(
+                    make_datagram_record(
                         Datagram(
                             frame, number * 1_000_000, ("192.0.2.1", port), ("192.0.2.2", port)
                         )
                     )
                 )
             else:
-                file.write(packet_record(frame, number * 1_000_000))
+                file.write(make_packet_record(frame, number * 1_000_000))
     return path

@@ -10,7 +10,7 @@ import pytest
 
 import lidarspec
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import CaptureStats, Datagram, StreamReader, datagram_frame
+from lidarspec.captures.pcap import CaptureStats, Datagram, StreamReader, make_datagram_frame
 from lidarspec.captures.records import WRITINGS
 from lidarspec.recording.recorders import FrameRecorder, open_recorder
 from lidarspec.transports.open_url import open_transport
@@ -34,7 +34,7 @@ def test_the_writer_s_captures(suffix: str, tmp_path: Path) -> None:
             datagram = Datagram(
                 draw.randbytes(size), at, ("192.0.2.1", 49_152 + number), ("192.0.2.2", 49_000)
             )
-            file.write(writing.record(datagram_frame(datagram), at))
+            file.write(writing.record(make_datagram_frame(datagram), at))
     fields = ["frame.time_epoch", "udp.length", "ip.src", "udp.dstport"]
     text = tshark(
         capture, "-T", "fields", *(option for name in fields for option in ("-e", name)), *CHECKED

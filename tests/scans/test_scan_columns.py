@@ -18,8 +18,8 @@ import pytest
 import lidarspec as ls
 from lidarspec import Decoder, Packets, PointCloud, Scan, Sensor, simulate
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import Datagram, datagram_record
-from lidarspec.captures.records import capture_head
+from lidarspec.captures.pcap import Datagram, make_datagram_record
+from lidarspec.captures.records import make_capture_head
 from lidarspec.errors import UsageError
 from lidarspec.frames.frame_table import CompiledTable
 from lidarspec.packets.stream import PacketStream
@@ -200,10 +200,10 @@ def test_a_scan_is_forgotten_once_it_was_given(opened: bool, tmp_path: Path) -> 
     sensor, path = ls.sensor("velodyne-vlp16"), tmp_path / "some.pcap"
     frames = simulate(sensor, 700)
     with path.open("wb") as file:
-        file.write(capture_head(ETHERNET))
+        file.write(make_capture_head(ETHERNET))
         for frame in frames:
             file.write(
-                datagram_record(
+                make_datagram_record(
                     Datagram(frame, 10**18, ("192.168.1.200", 2368), ("192.168.1.102", 2368))
                 )
             )

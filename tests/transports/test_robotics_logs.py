@@ -14,8 +14,8 @@ import pytest
 import lidarspec as ls
 from lidarspec import SourceError
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import Datagram, datagram_record
-from lidarspec.captures.records import capture_head
+from lidarspec.captures.pcap import Datagram, make_datagram_record
+from lidarspec.captures.records import make_capture_head
 from lidarspec.formats import write
 from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import Chunk
@@ -272,10 +272,10 @@ def test_damage_in_a_log_of_our_own_packets_is_a_source_error(tmp_path: Path, su
     source = tmp_path / "it.pcap"
     ends = ("192.168.1.201", 2368), ("192.168.1.77", 2368)
     records = [
-        datagram_record(Datagram(data, START + STEP * number, *ends))
+        make_datagram_record(Datagram(data, START + STEP * number, *ends))
         for number, data in enumerate(packets(20))
     ]
-    source.write_bytes(capture_head(ETHERNET) + b"".join(records))
+    source.write_bytes(make_capture_head(ETHERNET) + b"".join(records))
     log = tmp_path / f"out.{suffix}"
     ran("convert", "--packets", source, log, "-s", "velodyne-vlp16")
     whole = log.read_bytes()
@@ -298,10 +298,10 @@ def test_packets_are_the_same_through_every_container(tmp_path: Path) -> None:
     source = tmp_path / "it.pcap"
     ends = ("192.168.1.201", 2368), ("192.168.1.77", 2368)
     records = [
-        datagram_record(Datagram(data, START + STEP * number, *ends))
+        make_datagram_record(Datagram(data, START + STEP * number, *ends))
         for number, data in enumerate(sent)
     ]
-    source.write_bytes(capture_head(ETHERNET) + b"".join(records))
+    source.write_bytes(make_capture_head(ETHERNET) + b"".join(records))
     for suffix in ("mcap", "bag", "rosbag2", "db3", "lsr", "pcap"):
         target = tmp_path / f"out.{suffix}"
         words = ("record",) if suffix in ("lsr", "pcap") else ("convert", "--packets")
