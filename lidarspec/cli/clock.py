@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.inputs import FirstFrameTimeout, no_scan_error, report_outcome
+from lidarspec.cli.inputs import FirstFrameTimeout, make_no_scan_error, report_outcome
 from lidarspec.cli.options import DURATION, sensor_option
 from lidarspec.cli.terminal import say
 from lidarspec.detect.doctor import Diagnosis
@@ -71,7 +71,7 @@ class SourceClock:
         """
         report = self._monitor.report()
         if not report.packets:
-            raise no_scan_error(self.device, self.source)
+            raise make_no_scan_error(self.device, self.source)
         return report
 
 

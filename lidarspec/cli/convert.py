@@ -20,8 +20,8 @@ from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.inputs import (
     identify_file,
     iter_device_scans,
-    no_frame_error,
-    no_sensor_error,
+    make_no_frame_error,
+    make_no_sensor_error,
     refuse_overwriting,
     report_outcome,
     reread,
@@ -605,7 +605,7 @@ def _detect_sensor(source: str, target: str) -> Sensor:
         raise suggest(error, f"lidarspec convert {quote(source)} {quote(target)} -s ID") from None
     except WireError as error:
         sample = None if suggestion(error) else reread(source)
-        raise error if sample is None else no_sensor_error(sample) from None
+        raise error if sample is None else make_no_sensor_error(sample) from None
 
 
 def _make_no_data_error(device: Device, target: str, content: str = "") -> Exception:
@@ -636,7 +636,7 @@ def _make_no_data_error(device: Device, target: str, content: str = "") -> Excep
         return suggest(error, f"lidarspec convert {quote(source)} {quote(target)} {instead[1]}")
     sample = reread(source) if not stats.frames else None
     if sample is not None:
-        return no_frame_error(sensor, sample)
+        return make_no_frame_error(sensor, sample)
     return suggest(
         WireError(f"no data frame in {source}: {stats}", sensor=sensor.id),
         f"lidarspec explain {quote(source)} -s {sensor.id}",

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.inputs import no_frame_error, no_sensor_error, open_input
+from lidarspec.cli.inputs import make_no_frame_error, make_no_sensor_error, open_input
 from lidarspec.cli.listing import emit_lines
 from lidarspec.cli.options import OFFSET, count_option, selection_options, sensor_option
 from lidarspec.cli.output import emit_json, emit_json_list, emit_parts, output_options, table
@@ -53,7 +53,7 @@ def parse(
         selected = wanted.iter_valid(iter_pieces(sensor, chunks, datagrams=sample.datagrams))
         first = next(selected, None)
         if first is None:
-            raise no_frame_error(sensor, sample)
+            raise make_no_frame_error(sensor, sample)
         frames = itertools.chain([first], selected)
         if as_json:
             emit_json_list(
@@ -166,7 +166,7 @@ def explain(
     with open_input(words, selection.times) as (sample, chunks):
         sensor, fits = _find_sensor(sample, sensor_id, allow_similar=True)
         if not sample.data:
-            raise no_frame_error(sensor, sample)
+            raise make_no_frame_error(sensor, sample)
         pieces = iter_pieces(sensor, chunks, datagrams=sample.datagrams, frame=frame)
         if diff is not None:
             _compare(sensor, sample, pieces, diff, frame, as_json=as_json, output=output)
@@ -343,7 +343,7 @@ class FrameSelection:
                     sensor=self._sensor.id,
                 )
             raise (
-                no_frame_error(self._sensor, sample)
+                make_no_frame_error(self._sensor, sample)
                 if self._fault is None
                 else suggest(self._fault, f"lidarspec show {self._sensor.id}")
             )
@@ -399,7 +399,7 @@ def _compare(
     )
     first = next(frames, None)
     if first is None:
-        raise no_frame_error(sensor, sample)
+        raise make_no_frame_error(sensor, sample)
     if diff == "next":
         other = next((piece for piece in frames if piece.frame == first.frame), None)
         if other is None:
@@ -460,7 +460,7 @@ def _find_sensor(
             + (f", or of {', '.join(fits[1:])}; choose with -s" if fits[1:] else "")
         )
         return sensors[0], fits
-    fault = no_sensor_error(sample)
+    fault = make_no_sensor_error(sample)
     if not allow_similar or not fault.sensor:
         raise fault
     note(f"these bytes contain no valid frame; they are most similar to {fault.sensor}")

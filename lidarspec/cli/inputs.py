@@ -262,7 +262,7 @@ def _iter_input_files(argument: str | Path | Sensor | None) -> Iterator[str | in
         )
 
 
-def no_frame_error(sensor: Sensor, sample: SampleBytes) -> WireError:
+def make_no_frame_error(sensor: Sensor, sample: SampleBytes) -> WireError:
     """Return the error for an input that contains no frame of a sensor."""
     data = sample.data
     longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
@@ -297,7 +297,7 @@ def no_frame_error(sensor: Sensor, sample: SampleBytes) -> WireError:
     )
 
 
-def no_sensor_error(sample: SampleBytes) -> WireError:
+def make_no_sensor_error(sample: SampleBytes) -> WireError:
     """Return the error for an input that no sensor fits."""
     from lidarspec.detect.identification import find_nearest_fault
     from lidarspec.detect.uninstalled_sensors import suggest_installation
@@ -333,7 +333,7 @@ def _make_wrong_checksums_error(sample: SampleBytes) -> WireError | None:
     return None
 
 
-def no_scan_error(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
+def make_no_scan_error(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
     """Return the error that says why a source has no scan."""
     sensor = device.sensor
     stats = device.stats
@@ -480,7 +480,7 @@ class FirstFrameTimeout:
             and self._device.is_live
             and not any(name in self._device.stats.frames for name in self._awaited)
         ):
-            raise no_scan_error(self._device, self._source, waited)
+            raise make_no_scan_error(self._device, self._source, waited)
 
 
 def iter_device_scans(

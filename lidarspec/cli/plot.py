@@ -14,7 +14,7 @@ import click
 from lidarspec.cli.inputs import (
     FIRST_FRAME_TIMEOUT_S,
     iter_device_scans,
-    no_scan_error,
+    make_no_scan_error,
     refuse_overwriting,
     report_outcome,
     require_points,
@@ -144,7 +144,7 @@ def _find_scan(device: Device, source: str, selection: Selection, number: int) -
         if whole_count == number:
             break
     if chosen is None:
-        raise no_scan_error(device, source)
+        raise make_no_scan_error(device, source)
     if not whole_count:
         note(f"{source} has no complete scan, so an incomplete scan is drawn")
     elif whole_count < number:
@@ -167,7 +167,7 @@ def _draw_over_time(
     scans = iter_device_scans(device, source, selection, until=end_s)
     first = next(scans, None)
     if first is None:
-        raise no_scan_error(device, source)
+        raise make_no_scan_error(device, source)
 
     def iter_scans() -> Iterator[Scan]:
         yield first

@@ -18,7 +18,7 @@ from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.inputs import (
     FirstFrameTimeout,
     iter_device_scans,
-    no_scan_error,
+    make_no_scan_error,
     report_outcome,
     require_points,
 )
@@ -123,7 +123,7 @@ def read(
             say(line)
             printed += 1
         if not printed and not device.stats.frames:
-            raise no_scan_error(device, source, duration)
+            raise make_no_scan_error(device, source, duration)
         report_outcome(device)
 
 
@@ -433,7 +433,7 @@ def _print_stats(
         raise
     reading = _measure_input(feed, start)
     if reading.packets == 0:
-        raise no_scan_error(feed.device, source, reading.seconds)
+        raise make_no_scan_error(feed.device, source, reading.seconds)
     lines.print_summary(reading, feed.clock.report())
     return reading
 

@@ -9,7 +9,7 @@ import shlex
 import click
 
 from lidarspec.cli.failures import INTERRUPTED
-from lidarspec.cli.inputs import no_scan_error, refuse_overwriting
+from lidarspec.cli.inputs import make_no_scan_error, refuse_overwriting
 from lidarspec.cli.options import DURATION, SPEED, count_option, selection_options, sensor_option
 from lidarspec.cli.output import Progress, emit_json, format_size
 from lidarspec.cli.terminal import note, say
@@ -172,7 +172,7 @@ def _sum_up_recording(
         if not recorder.discard():
             note(f"{recorder.path} was not changed")
         if device is not None:
-            raise no_scan_error(device, source, task.elapsed)
+            raise make_no_scan_error(device, source, task.elapsed)
         if live_address(source) is not None:
             raise suggest(
                 CommandError(f"{source} sent nothing"), f"lidarspec doctor {shlex.quote(source)}"
@@ -198,7 +198,7 @@ def _sum_up_recording(
         }
         emit_json({**facts, **counts, "stats": stats.to_dict() if stats else None}, None)
     if stats is not None and not stats.frames and device is not None:
-        raise no_scan_error(device, source, task.elapsed)
+        raise make_no_scan_error(device, source, task.elapsed)
 
 
 def _describe_damage(stats: Counters) -> str:
@@ -293,7 +293,7 @@ def replay(
         speed=factor,
         needs_times=speed is not None,
         loop=loop,
-        source=source,
+        transport=source,
         times=selection.times,
     )
     is_interrupted = _run_replay(played, destination, file)

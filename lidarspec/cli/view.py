@@ -14,7 +14,7 @@ import click
 
 from lidarspec.cli.inputs import (
     FIRST_FRAME_TIMEOUT_S,
-    no_scan_error,
+    make_no_scan_error,
     refuse_overwriting,
     report_outcome,
     require_points,
@@ -245,7 +245,7 @@ def _show_in_rerun(
         feed = LiveScans(device, select=selection)
         show(feed, target, ramp=ramp, until=time.monotonic() + (duration or math.inf))
         if feed.scan is None:
-            raise no_scan_error(device, source, duration)
+            raise make_no_scan_error(device, source, duration)
         note(f"{target or 'shown'}: {feed.number} scans of {device.sensor.id}")
         report_outcome(device)
 
@@ -278,7 +278,7 @@ def _draw_once(
     ):
         feed.read(0.0)
     if feed.scan is None:
-        raise no_scan_error(device, source, patience)
+        raise make_no_scan_error(device, source, patience)
     columns, lines = shutil.get_terminal_size((80, 24))
     chosen = choose_appearance(feed.scan.points, ramp=ramp)
     cells: CellGrid = draw_cloud(

@@ -106,12 +106,12 @@ def distinguish(candidates: Sequence[Sensor], frames: Mapping[str, Sequence[Foun
     reasons = {name: why for relatives in excluding.values() for name, why in relatives.items()}
     if not left:
         return Distinction({}, {name: why for name, why in reasons.items() if name not in ids})
-    timed = _keep_matching(left, _match_clock, frames)
+    timed = _select_by_criterion(left, _match_clock, frames)
     named_among = [sensor for sensor in left if sensor.id in timed] or left
     if len(timed) == 1:
         selected = timed
     else:
-        selected = _keep_matching(named_among, _match_name, frames) or timed
+        selected = _select_by_criterion(named_among, _match_name, frames) or timed
     if selected:
         return Distinction(selected, {})
     differences = {
@@ -180,7 +180,7 @@ def _find_relatives_that_sent(sensor: Sensor, frames: Sequence[Found]) -> dict[s
     }
 
 
-def _keep_matching(
+def _select_by_criterion(
     candidates: Sequence[Sensor],
     match: Callable[[Sensor, Sequence[Found]], str],
     frames: Mapping[str, Sequence[Found]],

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from lidarspec.captures.bulk import CapturedDatagrams
 from lidarspec.detect.identification import find_reporting_frames, read_info
 from lidarspec.device.first_frames import FirstFrames, find_first_frames, needs_first_frames
-from lidarspec.device.sender_filter import SenderCheck, frame_senders
+from lidarspec.device.sender_filter import SenderCheck, find_frame_senders
 from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, SourceError
 from lidarspec.frames.schema import make_schema
@@ -201,7 +201,7 @@ def decode_chunks(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
         ends.append(end)
         times.append(-1 if chunk.at is None else chunk.at)
     batches = decoder.frames(b"".join([chunk.data for chunk in chunks]), chunks[-1].at)
-    return _set_arrival(batches, np.array(ends), np.array(times))
+    return _assign_arrival_times(batches, np.array(ends), np.array(times))
 
 
 def _decode_stream(
@@ -218,10 +218,10 @@ def _decode_stream(
     ends = decoder.stats.bytes_in + np.cumsum(datagrams.sizes)
     times = np.where(datagrams.at, datagrams.at, -1)
     for start in range(0, len(data), size):
-        yield _set_arrival(decoder.frames(data[start : start + size]), ends, times)
+        yield _assign_arrival_times(decoder.frames(data[start : start + size]), ends, times)
 
 
-def _set_arrival(
+def _assign_arrival_times(
     batches: Iterable[Frames], ends: NDArray[np.int64], times: NDArray[np.int64]
 ) -> list[Frames]:
     """Return the frames, each with the arrival time of its last byte.
@@ -385,7 +385,9 @@ class FileInput(DeviceInput):
                 yield FrameBatch(self.decoder.take_pending(), interrupted=chunks[0].gap)
             batches = decode_chunks(self.decoder, chunks)
             if not self.decoder.stream:
-                self.senders.check(frame_senders(chunks, batches[0], self.decoder.stats.bytes_in))
+                self.senders.check(
+                    find_frame_senders(chunks, batches[0], self.decoder.stats.bytes_in)
+                )
             yield FrameBatch(batches)
         yield FrameBatch(self.decoder.take_pending())
 

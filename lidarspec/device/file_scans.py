@@ -236,7 +236,7 @@ class _StatePickler(pickle.Pickler):
                 raise pickle.PicklingError(
                     "the parts of a frame cannot be pickled alone: pickle the packets of the frame"
                 )
-            state = {name: _take_states(*of) for name, of in obj.state.items()}
+            state = {name: _drop_unused_states(*of) for name, of in obj.state.items()}
             return object.__new__, (Packets,), {**vars(obj), "state": state, "_index": obj.index}
         if isinstance(obj, struct.Struct):
             return (struct.Struct, (obj.format,))
@@ -260,7 +260,7 @@ def _make_table(sensor: Sensor, frame: str, frames: list[bytes]) -> Table:
     return get_codec(sensor.frames[frame]).table_of_structs(frames)
 
 
-def _take_states(table: Table | None, which: Any) -> StateOf:
+def _drop_unused_states(table: Table | None, which: Any) -> StateOf:
     """Return the state frames of packets, without frames that no packet uses.
 
     Args:

@@ -20,7 +20,7 @@ from typing import Any
 from lidarspec.device.capture_thread import BoundedQueue, CaptureThread, Event, LinkEvent
 from lidarspec.device.device_input import DeviceInput, FrameBatch, decode_chunks, select_frames
 from lidarspec.device.link_state import LinkState
-from lidarspec.device.sender_filter import SenderFilter, frame_senders
+from lidarspec.device.sender_filter import SenderFilter, find_frame_senders
 from lidarspec.device.session import OutgoingData, PendingReply, Reply, Session, learn_options
 from lidarspec.errors import (
     CommandError,
@@ -452,7 +452,7 @@ class LiveInput(DeviceInput):
         decoder = self.decoder
         batches = decode_chunks(decoder, chunks)
         if not decoder.stream:
-            senders = frame_senders(chunks, batches[0], decoder.stats.bytes_in)
+            senders = find_frame_senders(chunks, batches[0], decoder.stats.bytes_in)
             batches = [self._senders.select_frames(senders, batches[0])]
         if self._senders.address is not None:
             self._captures["data"].transport.accept(self._senders.address)

@@ -155,7 +155,7 @@ class SenderFilter(SenderCheck):
         """Return the frames from the ports of the sensor, and count the other frames.
 
         Args:
-            sent: (frame type, sender) of the frames, as returned by `frame_senders`.
+            sent: (frame type, sender) of the frames, as returned by `find_frame_senders`.
         """
         count_before = len(self._other_senders)
         for name, sender in sent:
@@ -235,7 +235,9 @@ class SenderFilter(SenderCheck):
         self.other_sender = self.other_sender or sender
 
 
-def frame_senders(chunks: Sequence[Chunk], frames: Frames, end: int) -> list[tuple[str, Sender]]:
+def find_frame_senders(
+    chunks: Sequence[Chunk], frames: Frames, end: int
+) -> list[tuple[str, Sender]]:
     """Return pairs (frame type, sender) for the frames in some datagrams.
 
     The result has one pair for each frame, or, if all datagrams have the same sender, one pair for

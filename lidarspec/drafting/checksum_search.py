@@ -19,7 +19,7 @@ from lidarspec.drafting.samples import (
     CoveredSpan,
     SampleFrames,
     accept_any_place,
-    are_enough,
+    are_enough_valid,
     iter_spans,
     sort_matches,
     weigh_evidence,
@@ -282,7 +282,7 @@ def _iter_matches(
                 min_count = MIN_VALID_SHARE_WITH_CONSTANT * len(samples)
                 is_proven = valid_count >= min_count and not subset.is_single
             else:
-                is_proven = are_enough(valid_count, len(samples))
+                is_proven = are_enough_valid(valid_count, len(samples))
             if not is_proven or evidence_bits <= 0:
                 continue
             notes: tuple[str, ...] = ()
@@ -320,7 +320,7 @@ def _list_variants(
     mask = np.uint64(max_value)
     if isinstance(algorithm, Fletcher | Fold15):
         # A start value would change the result by an amount that depends on the length.
-        if are_enough(int((stored == computed).sum()), len(stored)):
+        if are_enough_valid(int((stored == computed).sum()), len(stored)):
             return [algorithm]
         return []
     if isinstance(algorithm, Xor | WordXor):
@@ -350,7 +350,7 @@ def _find_constant(values: NDArray[np.uint64]) -> list[int]:
     """Return [value] if nearly all elements have the same value, otherwise []."""
     distinct, counts = np.unique(values, return_counts=True)
     most_frequent = int(counts.argmax())
-    if are_enough(int(counts[most_frequent]), len(values)):
+    if are_enough_valid(int(counts[most_frequent]), len(values)):
         return [int(distinct[most_frequent])]
     return []
 
@@ -371,7 +371,7 @@ def _iter_nibble_matches(
         for span in spans:
             valid_count = int((samples.compute_checksums(Xor(), place, span) == stored).sum())
             evidence_bits = weigh_evidence(8, stored, 0, NIBBLE_TRIALS)
-            if are_enough(valid_count, len(samples)) and evidence_bits > 0:
+            if are_enough_valid(valid_count, len(samples)) and evidence_bits > 0:
                 note = (
                     "the checksum is stored in the low nibbles of two bytes, low half first:"
                     " name both bytes in Checksummed(field=(...))"

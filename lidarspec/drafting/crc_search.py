@@ -28,7 +28,7 @@ from lidarspec.drafting.samples import (
     CoveredSpan,
     SampleFrames,
     accept_any_place,
-    are_enough,
+    are_enough_valid,
     iter_spans,
     weigh_evidence,
 )
@@ -341,7 +341,7 @@ def _iter_matches(
         evidence_bits = weigh_evidence(
             crc.width, stored, fitted + (not is_known), tried * (len(CRCS) if is_known else 1)
         )
-        if are_enough(right, len(samples)) and evidence_bits > 0:
+        if are_enough_valid(right, len(samples)) and evidence_bits > 0:
             yield ChecksumMatch(
                 crc,
                 place,

@@ -370,7 +370,7 @@ def weigh_evidence(width: int, values: NDArray[np.uint64], fitted: int, tried: i
     return width * (len(np.unique(values)) - fitted) - float(np.log2(max(tried, 1)))
 
 
-def are_enough(valid_count: int, total: int) -> bool:
+def are_enough_valid(valid_count: int, total: int) -> bool:
     """Return whether enough frames are valid to assume that the others are damaged."""
     return valid_count >= max(1, MIN_VALID_SHARE * total)
 

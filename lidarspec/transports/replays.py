@@ -84,13 +84,13 @@ class Replay:
     """Sends a recording to an outlet or a file.
 
     Args:
-        file: the SOURCE of a recording, capture or raw file.
+        source: the SOURCE of the recording, capture or raw file.
         destination: an outlet, or a new file; it is not closed.
         speed: 2.0 is twice as fast as recorded; None is as fast as possible.
         needs_times: whether a file without times is an error. If False, a file without times is
             sent as fast as possible.
         loop: whether to start again at the end.
-        source: the open transport of the file, for example standard input; None to open the file.
+        transport: the open transport of `source`, for example standard input; None to open it.
         times: the range of arrival times to send, as for `Selection(times=...)`.
 
     Attributes:
@@ -102,21 +102,21 @@ class Replay:
 
     def __init__(
         self,
-        file: str,
+        source: str,
         destination: Outlet | BackgroundWriter,
         *,
         speed: float | None = 1.0,
         needs_times: bool = False,
         loop: bool = False,
-        source: Transport | None = None,
+        transport: Transport | None = None,
         times: Times = (None, None),
     ) -> None:
-        self._file = file
+        self._source = source
         self._destination = destination
         self._speed = speed
         self._needs_times = needs_times
         self._loop = loop
-        self._source = source
+        self._transport = transport
         self._times = times
         self._start = time.monotonic()
         self._endpoints: set[tuple[Sender | None, Sender | None]] = set()
@@ -158,15 +158,15 @@ class Replay:
                 self._start = time.monotonic()
             yield from self._run_once()
             if not self.chunks:
-                raise WireError(f"{self._file} contains no data")
+                raise WireError(f"{self._source} contains no data")
             if not self._loop:
                 return
 
     def _run_once(self) -> Iterator[str]:
-        opened = self._source or open_transport(self._file)
-        self._source = None
+        opened = self._transport or open_transport(self._source)
+        self._transport = None
         with contextlib.closing(opened) as source:
-            chunks = self._check_times(iter_received(source, self._times, self._file))
+            chunks = self._check_times(iter_received(source, self._times, self._source))
             try:
                 for chunk, late_ns in iter_at_deadlines(chunks, speed=self._speed):
                     self._send(chunk)
@@ -191,7 +191,7 @@ class Replay:
             if chunk.at is None and self._speed is not None and self.is_timed:
                 if self._needs_times:
                     raise UsageError(
-                        f"{self._file} has no arrival times, so only --speed max is supported"
+                        f"{self._source} has no arrival times, so only --speed max is supported"
                     )
                 self.is_timed = False
             yield chunk
