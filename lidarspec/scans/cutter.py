@@ -149,16 +149,19 @@ class ScanCutter:
         while start < stop:
             part_stop = min(start + SEARCHED_PACKETS, stop)
             part = counts.part(start, part_stop)
-            row, is_overdue = self._limits.find_excess(self._scan, part, self._usual_packets)
+            row, exceeds_maximum = self._limits.find_excess(self._scan, part, self._usual_packets)
             if row is None:
                 self._scan = self._scan.add(part)
                 start = part_stop
                 continue
             start += row
             cuts.append(start)
-            if is_overdue and abs(self._find_step_ns(counts, start)) < self._limits.longest_ns / 2:
+            if (
+                exceeds_maximum
+                and abs(self._find_step_ns(counts, start)) < self._limits.longest_ns / 2
+            ):
                 packets.stats.unended = self._warning
-            elif not is_overdue:
+            elif not exceeds_maximum:
                 self._usual_packets *= 2  # in case the number was wrong
             self._scan = OpenScan()
             counts.share_with_next_scan(start)

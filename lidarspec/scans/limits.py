@@ -1,8 +1,12 @@
 """Limit the duration and the size of scans, in case the end of a scan is missing.
 
-A scan takes at most twice the time of the slowest revolution, and has at most twice the number of
-points that the sensor declares. If this number varies, the size in bytes is limited. A scan with
-missing packets may have only a few packets more than an earlier scan.
+A scan that exceeds one of these limits is cut:
+
+* duration: twice the time of the slowest revolution.
+* size: twice the number of points that the sensor declares. If the number of points varies, the
+  size is limited in bytes.
+* number of packets, only for a scan with missing packets: an eighth more than an earlier scan,
+  which is normally the last whole scan.
 """
 
 from __future__ import annotations
@@ -59,7 +63,7 @@ class ScanLimits:
         """Return whether a scan is within the limits.
 
         Args:
-            scan: the counts of the scan with `packets`.
+            scan: the counts of the scan so far, including `packets`.
             packets: the last packets of the scan.
             usual_count: the number of packets, received and missing, of an earlier scan; inf if it
                 is unknown.
@@ -78,25 +82,25 @@ class ScanLimits:
         """Find the first packet with which a scan exceeds the limits.
 
         Args:
-            scan: the counts of the scan without `packets`.
+            scan: the counts of the scan so far, without `packets`.
             packets: the next packets.
             usual_count: as for `allows`.
 
         Returns:
-            (row, is_overdue). `row` is the row of this packet; None if there is none. `is_overdue`
-            is True if the scan exceeds its maximum duration or size. It is False if the scan
-            exceeds only the number of packets that a scan with missing packets may have, or if
-            `row` is None.
+            (row, exceeds_maximum). `row` is the row of this packet; None if there is none.
+            `exceeds_maximum` is True if the scan exceeds its maximum duration or size. It is False
+            if the scan exceeds only the number of packets that a scan with missing packets may
+            have, or if `row` is None.
         """
         since = scan.since if scan.packets else packets.times.item(0)
-        is_overdue = np.abs(packets.times - since) > self.longest_ns
-        is_overdue |= scan.size + np.cumsum(packets.sizes) > self._largest
+        exceeds_maximum = np.abs(packets.times - since) > self.longest_ns
+        exceeds_maximum |= scan.size + np.cumsum(packets.sizes) > self._largest
         lost = scan.lost + np.cumsum(packets.missing)
         length = scan.packets + np.cumsum(packets.counts) - 1 + lost
-        is_over = is_overdue | ((lost > 0) & (length > MAX_GROWTH * usual_count))
+        is_over = exceeds_maximum | ((lost > 0) & (length > MAX_GROWTH * usual_count))
         if not scan.packets:
             is_over[0] = False  # a scan has at least one packet
         row = int(is_over.argmax())
         if is_over[row]:
-            return row, bool(is_overdue[row])
+            return row, bool(exceeds_maximum[row])
         return None, False

@@ -5,8 +5,8 @@ of a packet, `Packets.masked`, is the number of packets that the sector leaves o
 
 The sector is found in the first revolutions of a stream. A step of the angle that is much larger
 than other steps (a leap) may be the sector, or may be caused by lost packets. After the first leap,
-packets are held for about one revolution, until this is known. Therefore even the first scans can
-end and begin in the sector.
+packets are held for about one revolution, until this is known. Because these packets are held, even
+the first scans can end before the sector and begin after it.
 """
 
 from __future__ import annotations
@@ -133,10 +133,9 @@ class Masking:
         return [released if self.sector is None else self._set_masked(released)]
 
     def _find_leap(self, packets: Packets, angles: Angles) -> int | None:
-        """Search the next packets for the masked sector.
+        """Return the row of the packet after the first leap; None without a leap.
 
-        Returns:
-            The row of the packet after the first leap of the angle; None if there is no leap.
+        The angles of the packets are added to the search for the masked sector.
         """
         if self._finder is None:
             direction = self._reader.direction(packets.table)

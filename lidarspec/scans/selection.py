@@ -170,12 +170,13 @@ class TimeSlice:
             return wanted
         return wanted & (at < end)
 
-    def make_no_data_error(self, source: object, number: str = "data") -> UsageError:
+    def make_no_data_error(self, source: object, content: str = "data") -> UsageError:
         """Return the error to raise if a source has no data at the selected times.
 
         Args:
             source: the name of the source.
-            number: the amount of data in the source for the message, for example "12 scans,".
+            content: the data of the source in words, for example "frames". A comma follows a
+                number, as in "12 scans,", because the message continues with the times.
         """
         first = self.first or 0
         last = self.last or 0
@@ -183,7 +184,7 @@ class TimeSlice:
         if first > FIRST_DATE_NS:
             dates = f" ({format_date(first)} to {format_date(last)})"
         text = (
-            f"{source} has {number} from 0 s to {(last - first) * 1e-9:.3f} s{dates}; the"
+            f"{source} has {content} from 0 s to {(last - first) * 1e-9:.3f} s{dates}; the"
             " selection is outside this range"
         )
         return suggest(UsageError(text), f"lidarspec info {quote(str(source))}")
@@ -312,10 +313,11 @@ class ScanSelector:
         return self._utc.warnings if self._utc is not None else []
 
     def iter_selected(self, scans: Iterable[Scan | None]) -> Iterator[Scan | None]:
-        """Yield the selected parts of selected scans, and every None.
+        """Yield the selected parts of the selected scans.
 
         Args:
-            scans: the scans of the stream. A None means that no scan has arrived for some time.
+            scans: the scans of the stream. A None means that no scan has arrived for some time; it
+                is yielded too.
 
         Raises:
             UsageError: if there were scans, but none was selected.

@@ -137,7 +137,7 @@ class ScanStream:
         self._uses_sector = True
 
     def _take_parts_with_points(self, packets: Packets) -> Packets:
-        """Return the packets with the points: `packets`, or the parts of their frames."""
+        """Return the packets, or the parts of their frames if the parts contain the points."""
         # The index of the parts has no gap for a frame without parts: no packet is missing.
         parts = packets.with_points
         if parts is not packets:

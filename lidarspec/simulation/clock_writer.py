@@ -127,7 +127,10 @@ class ClockWriter:
 
     @property
     def can_follow_dates(self) -> bool:
-        """Whether the clock can follow a time scale: a date determines its reading."""
+        """Whether the clock can follow a time scale such as UTC.
+
+        This is possible if a date determines the reading of the clock.
+        """
         return not self.period_ns or DAY_NS % self.period_ns == 0
 
     def read(self, table: CompiledTable) -> Times:
@@ -571,7 +574,7 @@ def _shift_raw(
 def _get_encoding(info: FieldInfo) -> tuple[str, float, float, int, str]:
     """Return (unit, scale, offset, bits, kind) of a field.
 
-    The time fields of one clock have the same values.
+    Two fields with the same tuple are assumed to contain times of the same clock.
     """
     return info.unit, info.scale, info.offset, info.bits, info.kind
 

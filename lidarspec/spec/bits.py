@@ -47,11 +47,11 @@ class BitField:
 
     @cached_property
     def run(self) -> tuple[str, int, int, int] | None:
-        """The run of consecutive bits of an integer that is the value; None if there is none.
+        """The position of the value, if its bits are consecutive in an integer; else None.
 
-        The run is a tuple (byte order, first byte, number of bytes, lowest bit). The first three
-        items describe the integer: "<" or ">", the index of its first byte in the block, and its
-        size. The last item is the bit of the integer at which the value begins.
+        The position is a tuple (byte order, first byte, number of bytes, lowest bit). The first
+        three items describe the integer: "<" or ">", the index of its first byte in the block, and
+        its size. The last item is the lowest bit of the integer that belongs to the value.
         """
         parts = sorted(self.segments, key=lambda part: part.byte)
         first = parts[0].byte

@@ -173,7 +173,9 @@ class Scaled(layer.DescribedField):
         self.offset = offset
 
     def describe(self, info: FieldInfo) -> FieldInfo:
-        return replace(info, scale=self.scale, offset=self.offset, unit=self.unit, measured=True)
+        return replace(
+            info, scale=self.scale, offset=self.offset, unit=self.unit, has_declared_unit=True
+        )
 
 
 class SizeOf(layer.SizeField):

@@ -144,8 +144,8 @@ class FieldInfo:
         is_enforced: whether a parsed frame must have the value of `rebuilt` (`SizeOf`).
         labels: the names of raw values (construct's Enum).
         optional: whether some frames do not have the field.
-        measured: whether the plugin declares the unit with `Scaled`. The declared unit may be "",
-            for a plain number; all fields without `Scaled` have the unit "" too.
+        has_declared_unit: whether the plugin declares the unit with `Scaled`. The declared unit may
+            be "", for a plain number; all fields without `Scaled` have the unit "" too.
         adapter: the functions that decode raw values; None if raw values are not decoded.
     """
 
@@ -165,7 +165,7 @@ class FieldInfo:
     is_enforced: bool = False
     labels: Mapping[int, str] = field(default_factory=dict)
     optional: bool = False
-    measured: bool = False
+    has_declared_unit: bool = False
     adapter: Adapter | None = None
 
     @functools.cached_property
@@ -1208,7 +1208,8 @@ def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
             continue
         if symbol not in ("==", "!=") or not isinstance(pair[one], int | str):
             raise UntraceableExpressionError(
-                "an expression uses an Enum field as a number, but its parsed value is a name"
+                f"an expression uses the Enum field {known.path} as a number, but the value of this"
+                " field is a name: compare it with a name, or declare the field without Enum"
             )
         if pair[one] in known.info.labels:
             name = known.info.labels[pair[one]]

@@ -111,15 +111,15 @@ class NumberRun:
 
     @cached_property
     def highest(self) -> Values:
-        """The largest value of each number, signed or unsigned; 0 for a float, (n,)."""
+        """The largest value that each number can have, (n,); 0 for a float."""
         highest = np.where(self.kinds == "i", self.largest >> np.uint64(1), self.largest)
         return np.where(self.kinds == "f", np.uint64(0), highest)
 
     @cached_property
     def lowest(self) -> Values:
-        """The absolute value of the lowest value of each number, (n,).
+        """The absolute value of the lowest value that each number can have, (n,).
 
-        It is 0 for unsigned numbers and floats.
+        For example, it is 128 for a signed byte. It is 0 for unsigned numbers and floats.
         """
         lowest = (self.largest >> np.uint64(1)) + np.uint64(1)
         return np.where(self.kinds == "i", lowest, np.uint64(0))
@@ -196,9 +196,9 @@ class Decoded:
 
     @property
     def offsets(self) -> list[int]:
-        """The offset in the encoded frame at which the field of each struct byte begins.
+        """The offsets in the encoded frame, one for each byte of the struct, and `end`.
 
-        The last element is `end`.
+        The offset of a byte is the offset at which the field that contains this byte begins.
         """
         starts = [begins.repeat(sizes) for begins, sizes in self.spans]
         return [*np.concatenate([np.zeros(0, np.intp), *starts]).tolist(), self.end]
@@ -226,12 +226,12 @@ class WireForm(Protocol):
     def begins(self, texts: Sequence[Characters]) -> Characters:
         """Return the bytes with which every encoded frame begins.
 
-        An element is None if its byte varies. The result ends before the first byte without a fixed
-        offset. By default, the result is empty.
+        The result has None in place of a byte that varies. It ends before the first byte without a
+        fixed offset. By default, the result is empty.
 
         Args:
-            texts: the bytes of each of the bytes fields with which the struct begins. An element is
-                None if its byte varies.
+            texts: for each field of bytes at the start of the struct, the bytes of the field, with
+                None in place of a byte that varies.
         """
         return ()
 
@@ -334,9 +334,9 @@ def decode_runs(reader: RunReader, next_runs: NextRuns, size: int | None) -> Dec
     """Read the fields of a frame.
 
     Args:
-        size: the `position` of the reader after the last field of a complete frame: 1 plus the
-            offset in the frame at which the fields end. None if the end of the frame has not
-            arrived.
+        size: the `position` that the reader has after it has read all fields of the frame; None if
+            the end of the frame has not arrived. This position is after the separator or end mark
+            that follows the last field, so the fields end at ``size - 1``.
     """
     struct = b""
     spans = list[tuple[Offsets, Offsets]]()
@@ -651,9 +651,9 @@ class _TokenReader:
                 self._convert_signed(characters[self._begins])
 
     def _convert_numbers(self, characters: NDArray[np.uint8]) -> None:
-        """Store the number of each token that contains only digits in `_magnitudes`.
+        """Store in `_magnitudes` the number of each token that consists of digits only.
 
-        `_is_number` is set to False for all other tokens.
+        For all other tokens, `_is_number` is set to False.
         """
         values, is_digit = _make_digit_values(self._form.base)
         lengths = self._marks - self._begins

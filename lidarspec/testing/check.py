@@ -580,10 +580,9 @@ class Report:
         name: the sensor's id, or the checked name if the report is about loading errors.
         findings: the findings.
         skipped: property -> the reason why it does not apply.
-        measured: results of measurements of frames as text, by what was measured.
-        picture: results of measurements of points as text, by what was measured, for example
-            "data: rate" -> "4500 points per second, simulated". The author compares them with the
-            manual.
+        measured: quantity that was measured for frames -> result as text.
+        picture: quantity that was measured for points -> result as text, for example "data: rate"
+            -> "4500 points per second, simulated". The author compares the results with the manual.
     """
 
     name: str

@@ -127,7 +127,7 @@ def arguments_outside_ranges_are_errors(subject: SensorUnderTest, name: str) -> 
             )
 
 
-def an_exchange_holds(
+def check_exchange(
     sensor: Sensor, name: str, given: dict[str, Any], data: bytes, answer: bytes | None, path: str
 ) -> None:
     """Check that a command and its reply agree with a golden vector.
@@ -136,7 +136,7 @@ def an_exchange_holds(
         given: the arguments of the command, by name.
         data: the bytes of the command in the vector.
         answer: the bytes of the reply in the vector; None if the vector has no reply.
-        path: the entry of the vector, for the error.
+        path: the place that the error names: the key of the vector in its file, and the command.
 
     Raises:
         ViolationError: if the command is built with other bytes, or if `answer` is not recognized

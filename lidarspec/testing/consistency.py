@@ -42,7 +42,10 @@ SHIFT_COUNT = 24
 
 
 def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
-    """Check that the clock stays below `wraps_at` in packets of the sweep with high numbers."""
+    """Check that the clock of simulated packets stays below `wraps_at`.
+
+    Some packets have such high numbers in the sweep that the clock has wrapped before them.
+    """
     clock = subject.sensor.clock
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None or not isinstance(clock, Clock) or clock.wraps_at is None:

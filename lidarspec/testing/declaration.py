@@ -373,7 +373,7 @@ def _find_pure_numbers(frame: Frame, *, with_scale: bool = False) -> set[str]:
         info.path
         for node in nodes(frame.tree)
         for info in infos(node)
-        if info.measured and not info.unit and (with_scale or not info.scaled)
+        if info.has_declared_unit and not info.unit and (with_scale or not info.scaled)
     }
 
 
@@ -467,7 +467,10 @@ def _check_sync(
     chance = MAX_SYNC_SHARE + 4 * (MAX_SYNC_SHARE / len(matching)) ** 0.5
     share = expected if expected > MAX_SYNC_SHARE else share
     if expected > MAX_SYNC_SHARE or share > chance:
-        what = f"the constant bytes also occur at {share:.1%} of the offsets in the frame's content"
+        what = (
+            f"the constant bytes that begin the frame also occur at {share:.1%} of the offsets in"
+            " the rest of the frame"
+        )
         yield "LS204", what, name
 
 
@@ -483,7 +486,7 @@ def _check_strength(
     ]
     constant = [sum(mask.bit_count() for mask, _ in layout.known.values()) for layout in layouts]
     weakest = min(map(sum, zip(checked, constant, strict=True)))
-    if weakest <= _find_max_weak_bits(subject.sensor, frame):
+    if weakest <= _find_max_insufficient_bits(subject.sensor, frame):
         yield (
             "LS206",
             (
@@ -494,10 +497,10 @@ def _check_strength(
         )
 
 
-def _find_max_weak_bits(sensor: Sensor, frame: Frame) -> int:
-    """Return the highest number of constant and checksum bits that is too low for a frame.
+def _find_max_insufficient_bits(sensor: Sensor, frame: Frame) -> int:
+    """Return the largest number of constant and checksum bits that is not enough.
 
-    A frame with so few bits is too easily confused with other bytes.
+    A frame with this number of bits, or fewer, is too easily confused with other bytes.
     """
     if sensor.datagrams:
         return WEAK_BITS_IN_DATAGRAMS

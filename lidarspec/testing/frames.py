@@ -198,8 +198,7 @@ def wrong_rebuild_values_are_invalid(subject: SensorUnderTest, name: str) -> Non
 def is_rounded_down(before: Any, after: Any) -> bool:
     """Return whether a number has become a little lower, as if it was truncated.
 
-    An integer must be lower by exactly 1. A float must be lower by less than 1 plus a tenth of its
-    value.
+    An integer must be lower by exactly 1, a float by less than ``1 + abs(before) / 10``.
     """
     if (
         not isinstance(before, int | float)

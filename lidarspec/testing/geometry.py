@@ -118,7 +118,7 @@ def make_sweep(
 def decode_frames(
     subject: SensorUnderTest, name: str, frames: list[bytes], *, by_clock: bool = True
 ) -> Packets:
-    """Decode frames of one data type.
+    """Decode data frames of one type.
 
     Args:
         by_clock: whether the times of packets are those of the sensor's clock; False to ignore the

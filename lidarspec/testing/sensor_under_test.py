@@ -172,8 +172,8 @@ class SensorUnderTest:
         vectors: the file of golden vectors; None if there is no such file.
         family: the ids of the sensors that share the file of golden vectors.
         tested: related models; frame types that they share with this sensor are not tested again.
-        measured: results of measurements of frames as text, by what was measured.
-        picture: results of measurements of points as text, by what was measured.
+        measured: quantity that was measured for frames -> result as text.
+        picture: quantity that was measured for points -> result as text.
         traced: data frame -> the result of `geometry.trace_points`.
         frames_with_two_quadrants: names of the data frames whose golden vectors have points in two
             quadrants.

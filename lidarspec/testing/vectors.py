@@ -34,7 +34,7 @@ from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.frames.layout import Layout
 from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.spec.tree import ChecksummedStruct, FieldInfo, nodes
-from lidarspec.testing.commands import an_exchange_holds
+from lidarspec.testing.commands import check_exchange
 from lidarspec.testing.findings import ViolationError, require
 from lidarspec.testing.frames import iter_leaves
 from lidarspec.testing.geometry import decode_frames
@@ -134,7 +134,7 @@ def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
                 answer = parse_hex(vector["reply"])
             else:
                 answer = None
-            an_exchange_holds(
+            check_exchange(
                 subject.sensor,
                 vector["command"],
                 vector.get("args", {}),

@@ -121,8 +121,8 @@ class OutletLine:
         For links without connections, such as UDP, this returns at once.
 
         Returns:
-            True if a program was listening when the method was called, and has closed the port
-            during the wait. The user is then informed that the reader has left.
+            True if the previous listener has left: the line had a listener when the method was
+            called, but this listener has closed the port. The user is then informed of this.
         """
         return False
 
@@ -341,19 +341,19 @@ class UdpLine(OutletLine):
             try:
                 self._sockets[0].sendto(data, receiver)
             except OSError as error:
-                if not self._may_succeed_later(error):
+                if not self._handle_send_error(error):
                     return False
             else:
                 return True
         return False
 
-    def _may_succeed_later(self, error: OSError) -> bool:
-        """Return whether to try to send a datagram again.
+    def _handle_send_error(self, error: OSError) -> bool:
+        """Return whether to send a datagram again after an error.
 
         If a buffer is full, the method waits before it returns.
 
         Raises:
-            SourceError: if sending fails, and the user has named the receiver.
+            SourceError: if sending again is useless, and the user has named the receiver.
         """
         if error.errno in (errno.EAGAIN, errno.EWOULDBLOCK):
             wait_ready([], [self._sockets[0]], POLL_S)

@@ -47,8 +47,8 @@ class LiveScans:
             instead of as fast as possible.
         speed: the first value of the attribute `speed`.
         select: the scans to show; None for all.
-        ahead: approximate number of seconds of a played file to read at a time; None to read as
-            fast as possible.
+        ahead: approximately how many seconds of a played file are read at a time; None to read
+            pieces of the default size, which is the fastest.
 
     Attributes:
         speed: how fast a file is played; 2.0 is twice as fast as recorded. It may be changed.

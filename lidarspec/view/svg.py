@@ -116,7 +116,7 @@ class _ViewDrawer:
     """Draws the views of a cloud.
 
     Attributes:
-        side: side of the view from above, in pixels.
+        side: width and height of the view from above, in pixels.
         max_dots: maximum number of dots in a view; None for no limit.
         colours: the colour of each point, as a step of the colour ramp, (n,).
     """

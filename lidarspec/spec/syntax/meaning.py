@@ -419,7 +419,8 @@ class _Builder:
                 reason = f"the value of the expression is always {value!r}, which is no integer"
             elif not is_key and isinstance(value.formula, tree.Ref) and value.formula.info.labels:
                 reason = (
-                    "an expression uses an Enum field as a number, but its parsed value is a name"
+                    f"an expression uses the Enum field {value.formula.path} as a number, but"
+                    " the value of this field is a name: declare the field without Enum"
                 )
             elif fraction is not None and not may_be_fraction:
                 reason = f"the result of an expression with {fraction!r} is not always an integer"
@@ -959,7 +960,9 @@ def _find_offset_after(
 
 
 def _is_single_value(ref: tree.Ref, info: tree.FieldInfo) -> bool:
-    """Return whether a field has one number that each element of a computed value can use.
+    """Return whether a field has one number for each element of a computed value.
+
+    Several elements may have the same number, for example that of a field of the whole frame.
 
     Args:
         ref: a reference to the field.

@@ -337,7 +337,8 @@ class ExactFloat(FormatField):  # type: ignore[misc]
 class NamedEnum(construct.Enum):  # type: ignore[misc]
     """An Enum whose value is a name in expressions, as in ``this.mode == "dual"``.
 
-    The value equals the name also while a frame is built from the number.
+    This is also true while a frame is built and the caller has given the number instead of the
+    name.
     """
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:

@@ -704,7 +704,8 @@ def iter_leaves(
 def is_expression(value: object) -> bool:
     """Return whether a value is an expression of construct, such as `this.a > 1`.
 
-    A construct itself also counts as an expression: both have no value without a frame.
+    A Construct object, such as `Int8ub`, also counts as an expression, because it too has no value
+    without a frame.
     """
     return isinstance(value, ExprMixin | Construct)
 
