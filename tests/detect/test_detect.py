@@ -326,8 +326,8 @@ def test_frames_with_only_wrong_checksums_are_reported(tmp_path: Path) -> None:
     )
     assert found.fault.startswith(f"60 data frames have the constants and lengths of {alike}, ")
     assert (
-        "The checksum CRC-8 poly 0x4d matches the last byte in 60 of 60 frames, over 45 of 47 bytes"
-        in found.fault
+        "In 60 of 60 frames, the checksum field (the last byte) contains CRC-8 poly 0x4d, computed"
+        " over 45 of 47 bytes" in found.fault
     )
     path.write_bytes(data)
     with pytest.raises(WireError, match="all have wrong checksums") as error:
