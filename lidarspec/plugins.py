@@ -672,7 +672,7 @@ def named_owners() -> dict[str, str]:
                 ' such as acme-x1 = "acme-lidars"'
             )
     except LidarSpecError as error:
-        warnings.warn(f"{error}; all [owners] in this file are ignored", stacklevel=2)
+        warnings.warn(f"{error}; the table [owners] of this file is ignored", stacklevel=2)
         return {}
     return named
 

@@ -109,7 +109,7 @@ def sensors(as_json: bool, output: str | None) -> None:
     if broken:
         note(
             f"{len(broken)} plugin{'s' * (len(broken) > 1)} could not be loaded;"
-            " next: lidarspec plugins"
+            " to see why, run lidarspec plugins"
         )
 
 

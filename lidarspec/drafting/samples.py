@@ -56,7 +56,7 @@ class ChecksumPlace:
                 return f"the last {self.size} bytes"
             return "the last byte"
         if self.offset < 0:
-            where = f"at {-self.offset} bytes before the end"
+            where = f"beginning {-self.offset} bytes before the end"
         else:
             where = f"at byte {self.offset}"
         return f"{self.size} byte{'s' * (self.size > 1)} {where}"
@@ -96,7 +96,7 @@ class CoveredSpan:
         if self.covers_all or covered_bytes == length - place.size:
             return "all other bytes"
         if self.part == "before":
-            return f"the bytes from {self.head} up to the checksum"
+            return f"the bytes from offset {self.head} up to the checksum"
         omitted = []
         if self.head > 0:
             omitted.append(f"the first {self.head}")
@@ -146,8 +146,8 @@ class ChecksumMatch:
         """All remarks for the user."""
         if self.has_constant:
             constant = (
-                "the checksum contains a constant, which is a start value or comes from constant"
-                " bytes"
+                "the checksum differs from the algorithm by a constant: a start value, or the share"
+                " of bytes that are equal in all frames"
             )
             return (constant, *self.notes)
         return self.notes

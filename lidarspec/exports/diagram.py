@@ -527,7 +527,7 @@ def _right_edge(piece: Piece | None) -> float:
 
 
 def _touches(piece: Piece, other: Piece) -> bool:
-    """Return whether two pieces touch, one above the other."""
+    """Return whether one of two pieces is directly above the other."""
     return abs(piece[1] - other[1]) == ROW_HEIGHT_PX and max(piece[0], other[0]) < min(
         _right_edge(piece), _right_edge(other)
     )

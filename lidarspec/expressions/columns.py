@@ -62,9 +62,9 @@ class Batch:
         defaults: the declared defaults of state columns, by frame type and path.
         carry: the values from the previous batch that each call of `previous` or `last` needs:
             number of the call in the function, from 0 -> values.
-        carry_functions: for each call of `previous` or `last` so far, a function that returns the
-            values for `carry` of the next batch. The argument of the function is the index of the
-            packet with which the next batch begins.
+        functions_of_carry: for each call of `previous` or `last` so far, a function that returns
+            the values for `carry` of the next batch. The argument of the function is the index of
+            the packet with which the next batch begins.
         nominal: whether a declared default of a state column was used.
     """
 
@@ -74,7 +74,7 @@ class Batch:
     defaults: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     carry: Carry = field(default_factory=dict)
     nominal: bool = False
-    carry_functions: list[Callable[[int], NDArray[np.float64]]] = field(default_factory=list)
+    functions_of_carry: list[Callable[[int], NDArray[np.float64]]] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.table)
@@ -85,7 +85,7 @@ class Batch:
         Args:
             ready: the index of the packet with which the next batch begins.
         """
-        return {slot: carry(ready) for slot, carry in enumerate(self.carry_functions)}
+        return {slot: carry(ready) for slot, carry in enumerate(self.functions_of_carry)}
 
     def of(self, group: LayoutRows) -> Batch:
         """Return a batch with only the packets of a group, without `carry`."""
@@ -309,7 +309,7 @@ class Column(NDArrayOperatorsMixin):
         """
         row = FlatColumn(self)
         size = abs(step)
-        slot = len(self.batch.carry_functions)
+        slot = len(self.batch.functions_of_carry)
         carried = self.batch.carry.get(slot, np.empty(0))
         if len(carried):
             values = np.concatenate([carried, row.values])
@@ -331,7 +331,7 @@ class Column(NDArrayOperatorsMixin):
                 ready,
                 int(np.searchsorted(row.starts, certain, side="right")) - 1 if certain >= 0 else 0,
             )
-        self.batch.carry_functions.append(
+        self.batch.functions_of_carry.append(
             lambda upto: _take_connected_tail(
                 values, edges, len(carried) + row.starts[upto], 0 if step > 0 else size
             )
@@ -357,12 +357,12 @@ class Column(NDArrayOperatorsMixin):
             for array in (values, flags)
         ]
         row, known = (FlatColumn(column) for column in both)
-        slot = len(self.batch.carry_functions)
+        slot = len(self.batch.functions_of_carry)
         carried = self.batch.carry.get(slot, np.full(1, np.nan))
         numbers = np.concatenate([carried, row.values])
         starts = np.concatenate([[0], 1 + np.flatnonzero(known.values > 0)])
         latest = np.repeat(numbers[starts], np.diff(starts, append=len(numbers)))
-        self.batch.carry_functions.append(lambda upto: latest[: 1 + row.starts[upto]][-1:])
+        self.batch.functions_of_carry.append(lambda upto: latest[: 1 + row.starts[upto]][-1:])
         return Column(row.unflatten(latest[1:]), axes, self.batch, ready=ready)
 
 

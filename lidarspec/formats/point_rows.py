@@ -78,7 +78,7 @@ class PointRows:
         return itertools.starmap(self.fill, self.iter_parts())
 
     def iter_parts(self) -> Iterator[tuple[Mapping[str, NDArray[Any]], PointCloud]]:
-        """Yield the columns and points of each scan, for `fill`."""
+        """Yield the selected columns and the whole point cloud of each scan, for `fill`."""
         for number, scan in enumerate(self._scans):
             yield self._select_columns(scan, number, self.dtype.names or ()), scan.points
 

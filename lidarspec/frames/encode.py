@@ -618,7 +618,7 @@ def find_kind(node: PartSequence, part: Mapping[str, Any]) -> Kind:
 
 @functools.lru_cache(maxsize=1024)
 def list_paths(root: Node) -> frozenset[str]:
-    """Return the paths of all fields of a frame type, and of their structs and arrays."""
+    """Return the paths of all fields of a frame type, and of the structs around them."""
     table = make_schema(root)
     paths = {*table.all_fields, *table.arrays, *table.derived}
     for node in nodes(root):

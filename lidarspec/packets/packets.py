@@ -297,7 +297,7 @@ class Packets:
 
     @property
     def with_points(self) -> Packets:
-        """The packets to which `points` is applied: these packets, or their parts."""
+        """These packets, or the parts of their frames that contain the points."""
         path = self.sensor.parts_with("points", self.frame)
         if path:
             return self.parts(path)

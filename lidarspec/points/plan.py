@@ -293,7 +293,7 @@ class Plan:
     def _may_have_finite_directions(self) -> bool:
         """Whether azimuth and elevation are finite, as far as is known without a batch."""
         fixed = all(
-            isinstance(part, Node) or np.isfinite(part).all() for part in self._directions_given
+            isinstance(part, Node) or np.isfinite(part).all() for part in self._given_directions
         )
         return fixed and all(
             np.isfinite(term.row).all() and (term.full is None or self._is_finite(term.full))
@@ -307,10 +307,10 @@ class Plan:
     @property
     def directions(self) -> list[Node]:
         """Azimuth and elevation, if they depend on data."""
-        return [part for part in self._directions_given if isinstance(part, Node)]
+        return [part for part in self._given_directions if isinstance(part, Node)]
 
     @property
-    def _directions_given(self) -> tuple[Any, ...]:
+    def _given_directions(self) -> tuple[Any, ...]:
         if self.exact:
             return ()
         return (self.parts["azimuth"], self.parts["elevation"])

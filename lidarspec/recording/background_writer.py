@@ -141,7 +141,7 @@ class TrafficLog(Protocol):
     def error(self) -> SourceError | None: ...
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Record received or sent data with its time."""
+        """Add data that was received or sent to the recording, with its time."""
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
         """Record an event of the connection, such as "disconnect" or "reconnect".
@@ -200,7 +200,7 @@ class BackgroundWriter:
         atexit.register(self._finish)
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Record received or sent data with its time."""
+        """Add data that was received or sent to the recording, with its time."""
         raise NotImplementedError
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:

@@ -270,7 +270,7 @@ def _read_rows(column: Column, points: EvaluatedPoints) -> tuple[Floats, Indices
 def first_points(points: EvaluatedPoints) -> Indices:
     """Return the index of the first point of each packet, (n,).
 
-    There are n = `points.ready` packets with points. Later packets wait for the next batch.
+    `points.ready` is n. The points of the other packets are computed with the next batch.
     """
     points_per_packet = _sum_axes(points.counts, 1)
     return np.cumsum(points_per_packet) - points_per_packet

@@ -1115,7 +1115,7 @@ class Value:
     """A computed value that later expressions can read.
 
     Attributes:
-        content: a formula or a constant; `Untraced` if the value has no formula.
+        content: a formula or a constant; `Untraced` if neither is known.
     """
 
     content: Any

@@ -1034,7 +1034,7 @@ class Lines:
         return NO_END
 
     def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
-        """Return the sizes of frames; `NO_FRAME` if a line has a wrong length."""
+        """Return the size of each frame; `NO_FRAME` if a line of it has a wrong length."""
         newlines = np.flatnonzero(buffer == NEWLINE)
         steps = np.diff(newlines, prepend=0)
         ends = find_next_offsets(newlines[:-1][steps[1:] == 1], offsets, len(buffer))

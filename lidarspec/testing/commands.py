@@ -220,7 +220,7 @@ def _check_learned_options(subject: SensorUnderTest, name: str, reply: Reply) ->
             sensor.configure(**values)
     except Exception as error:  # any error of `learns` and `configure` of the plugin
         if name in sensor.simulation.answers:
-            what = f"the options cannot be read from the reply that answers= provides: {error}"
+            what = f"the options cannot be read from the reply in `answers`: {error}"
         else:
             what = f"the options cannot be read from the simulated reply: {error}"
         raise ViolationError("LS604", what, f"commands.{name}") from error

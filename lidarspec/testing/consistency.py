@@ -59,7 +59,7 @@ def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
         return
     most = int(readings.max(initial=0))
     wraps_at_s = float(clock.wraps_at)
-    message = f"the clock reaches {most / 1e9:g} s in the sweep, but wraps_at is {wraps_at_s:g} s"
+    message = f"the clock of the sweep reaches {most / 1e9:g} s, but wraps_at is {wraps_at_s:g} s"
     require(most <= to_exact(clock.wraps_at) * 10**9, "LS512", message, "clock")
 
 

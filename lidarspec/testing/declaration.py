@@ -599,7 +599,7 @@ def _check_range_limit(subject: SensorUnderTest) -> Findings:
 def _check_column(
     subject: SensorUnderTest, name: str, value: Any, column: str, units: tuple[str, ...]
 ) -> Findings:
-    """Yield a finding if no source field of a column has one of these units."""
+    """Yield a finding if no source field of a column has one of the `units`."""
     infos = [
         find_field_of_node(subject, name, node)
         for node in find_source_nodes(value, include_indices=False)

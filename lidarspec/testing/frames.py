@@ -107,7 +107,7 @@ def bytes_survive_parsing_and_building(subject: SensorUnderTest, name: str) -> N
             require(
                 are_equal(parsed, again),
                 "LS302",
-                "a parsed frame is built again, and parsing the built frame gives other values",
+                "after parsing and building a frame, parsing it again gives different values",
                 name,
             )
 

@@ -292,8 +292,8 @@ def _parse_dump_bytes(text: str) -> bytes:
             if not data:
                 raise
             raise ValueError(
-                f"{text[:MAX_QUOTED_CHARS]!r}: the text at the end of the line does not match its"
-                " bytes, perhaps because xxd -e printed words"
+                f"{text[:MAX_QUOTED_CHARS]!r}: the text at the end of the line does not match the"
+                " bytes; perhaps xxd -e has reversed the bytes of each group"
             ) from None
         if comment or (
             # The first characters may be blanks, which are then part of the gap.

@@ -180,8 +180,8 @@ class UdpLine(OutletLine):
     """Sends UDP datagrams to a host, or to the sender of the last command.
 
     Attributes:
-        waits_for_address: whether the destination port is unknown at first. Datagrams are dropped
-            until a command gives the port, by its content or by its sender.
+        waits_for_address: whether the destination is unknown at first. Datagrams are dropped until
+            a command arrives that contains the port, or whose source port is used.
     """
 
     takes_commands = False

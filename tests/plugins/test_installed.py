@@ -393,7 +393,8 @@ def test_owners_that_cannot_be_read_are_warned_of(
         monkeypatch.setenv(name, str(tmp_path))
     (file := user_settings_path()).parent.mkdir()
     file.write_text(text, encoding="utf-8")
-    with pytest.warns(UserWarning, match=rf"{file}: .*; all \[owners\] in this file are ignored"):
+    warning = rf"{file}: .*; the table \[owners\] of this file is ignored"
+    with pytest.warns(UserWarning, match=warning):
         assert named_owners() == {}
 
 

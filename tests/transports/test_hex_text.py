@@ -217,7 +217,7 @@ REFUSED = {
     "0000000 2c54 0e10 0868": "words in host byte order",
     "000000 54 2c 10 0e 54 2c 41 20": "the first zeros may be an offset or data",
     "00000000: 0e102c54 20412c54  T,..T,A ": (
-        "'T,..T,A': the text at the end of the line does not match its bytes"
+        "'T,..T,A': the text at the end of the line does not match the bytes"
     ),
     "00000000  54 2c 10 0e  |T,..|\n*\n00000020": "stands for repeated lines",
     "00000000  54 2c 10 0e  |T,..|\n00000020  54": "offset 00000020 follows 0x4 bytes",

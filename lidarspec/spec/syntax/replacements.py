@@ -517,15 +517,15 @@ class SizeField(Subconstruct):  # type: ignore[misc]
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
         value = self.subcon._parsereport(stream, context, path)
-        self._register_size(context, (path, start, value))
+        self._add_to_sizings(context, (path, start, value))
         return value
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         sizes = context._params.setdefault("_sizes", {})
-        self._register_size(context, (path, 0, obj))
+        self._add_to_sizings(context, (path, 0, obj))
         return self.subcon._build(sizes.get(path, obj or 0), stream, context, path)
 
-    def _register_size(self, context: Any, entry: tuple[str, int, Any]) -> None:
+    def _add_to_sizings(self, context: Any, entry: tuple[str, int, Any]) -> None:
         """Register this field in the struct that contains the part."""
         for _ in range(self.levels_up):
             context = context.get("_", {})

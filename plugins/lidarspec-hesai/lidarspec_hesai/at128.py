@@ -3,7 +3,7 @@
 A packet has 1086 bytes, 1118 with a signature. A mirror with three faces sweeps the beams over 120
 degrees to the front, and a scan is the sweep of one face. The beam turns by twice the angle of the
 mirror. The azimuth of a point is therefore twice the mirror's angle from the start of the face,
-plus the azimuth of the channel, plus a correction for the channel. The unit's file has the
+plus the azimuth of the channel, plus a correction for the channel. The sensor's file has the
 corrections for every two degrees of the mirror.
 
 The CRCs probably cover the same bytes as in packets of a QT128. No captured packet was available
@@ -95,7 +95,7 @@ FILE = Struct(
 
 @dataclass(frozen=True, eq=False)
 class Mirror(Calibration):
-    """A unit's mirror and channels.
+    """The mirror and the channels of a sensor.
 
     Attributes:
         faces: (faces,) the mirror angles at which the faces begin, degrees.
@@ -111,7 +111,7 @@ class Mirror(Calibration):
         """Return a copy with the angles of one unit.
 
         Args:
-            source: the path of the unit's correction file (.dat), or the unit's reply to the
+            source: the path of the sensor's correction file (.dat), or the sensor's reply to the
                 command `get_calibration`.
 
         Raises:

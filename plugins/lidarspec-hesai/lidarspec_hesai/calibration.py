@@ -26,8 +26,8 @@ MAX_FILE_BYTES = 1_000_000
 MAX_QUOTED_CHARACTERS = 60  # of a file, in an error message
 MARK = "EEFF"  # above the headings of some files
 HASH = re.compile(r"[0-9a-fA-F]{8,}")  # below the table of some files
-#: The spread of a unit's values may differ from that of the model by at most this factor. A file in
-#: radians instead of degrees would differ by a factor of 57.
+#: The spread of the values of an individual sensor may differ from that of the model by at most
+#: this factor. A file in radians instead of degrees would differ by a factor of 57.
 MAX_SPREAD_RATIO = 10
 
 
@@ -64,7 +64,7 @@ class Calibration:
         elevation: (channels,) degrees.
         azimuth: (channels,) degrees, clockwise as in the vendor's files.
         firing: (channels,) seconds after the time of the block.
-        nominal: whether the angles are those of the model, instead of those of the unit.
+        nominal: whether the angles are those of the model, not those of the individual sensor.
     """
 
     elevation: Table
@@ -79,7 +79,7 @@ class Calibration:
         """Return a copy with the angles of one unit.
 
         Args:
-            source: the path of the unit's correction file, or the unit's reply to the command
+            source: the path of the sensor's correction file, or the sensor's reply to the command
                 `get_calibration`.
 
         Raises:
@@ -120,16 +120,16 @@ def configure(
     calibration: str | Path | Learned | None = None,
     firing_times: str | Path | None = None,
 ) -> Sensor:
-    """Return the sensor with a unit's tables instead of the model's.
+    """Return the sensor with the tables of an individual sensor instead of the model's.
 
     If the angles are read from a file, opening the sensor does not request the angles.
 
     Args:
-        points: a function that returns points, given `Fields` and the unit's `Calibration`.
+        points: a function that returns points, given `Fields` and the sensor's `Calibration`.
         table: the nominal corrections of the model.
         calibration: a CSV file with the columns Channel (or Laser id), Elevation and Azimuth, in
-            degrees and in any order; or a binary file, if the model has one; or the unit's reply to
-            the command `get_calibration`.
+            degrees and in any order; or a binary file, if the model has one; or the sensor's reply
+            to the command `get_calibration`.
         firing_times: a CSV file with the columns Channel and Fire time, in microseconds.
 
     Raises:

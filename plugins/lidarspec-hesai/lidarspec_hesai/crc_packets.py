@@ -79,7 +79,7 @@ IMU = Struct(
     "acceleration_unit" / Int16ul * "step of `acceleration`, in millionths of g",
     "rate_unit" / Int16ul * "step of the angular rates, in hundredths of mdeg/s",
     "time" / Int32ul * "time of the sample, in steps of 25 ns",
-    "acceleration" / Array(3, Int16sl) * "x, y, z of the unit's IMU; its axes are not documented",
+    "acceleration" / Array(3, Int16sl) * "x, y, z of the sensor's IMU; its axes are not documented",
     "rate" / Array(3, Int16sl),
 )
 

@@ -21,10 +21,10 @@ def make_spinning_sensor(
     azimuth: str = "blocks.azimuth",
     **facts: Any,
 ) -> Sensor:
-    """Return a rotating sensor; opening it requests the angles of the unit.
+    """Return a rotating sensor; opening it requests the angles of the sensor.
 
     Args:
-        points: a function that returns points, given `Fields` and the unit's `Calibration`.
+        points: a function that returns points, given `Fields` and the sensor's `Calibration`.
         sweep: a function that returns the values of simulated packet i.
         azimuth: the path of the field that passes 0 at the end of a scan.
     """

@@ -13,7 +13,7 @@ The simulation has 600 azimuths per revolution, as in the vendor's code, and mak
 second. The axes of the IMU are not documented, so its samples are available as fields only.
 
 Commands are not supported: they use a second line (RS232, 9600 baud), and contain random numbers.
-The angles of a unit come from a correction file.
+The angles of a sensor come from a correction file.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_8.h, udp1_8_parser.cc: fields, steps of 4 mm, angles,
 CRC; serial_source.cc: lengths; parameter_introduction.md: 3,125,000 baud; JT16 correction file).
@@ -101,7 +101,7 @@ IMU = Checksummed(
         1,
         "acceleration"
         / Array(3, Scaled(Int16sl, 1 / 8192, "g"))
-        * "x, y, z of the unit's IMU; its axes are not documented",
+        * "x, y, z of the sensor's IMU; its axes are not documented",
         "rate" / Array(3, Scaled(Int16sl, 1 / 32.8, "deg/s")),
         "sequence" / Int16ul,
     ),

@@ -2,8 +2,8 @@
 
     47 74  code  result | length(4) | payload
 
-The angles of a unit are requested when it is opened. Units that support only TLS or PTC 2.0 (57 75)
-do not reply.
+The angles of a sensor are requested when it is opened. Sensors that support only TLS or PTC 2.0
+(57 75) do not reply.
 
 Source: HesaiLidar_SDK_2.0 (ptc_client.h, ptc_1_0_parser.h: frame and codes); tier4/nebula
 (hesai_common.hpp: numbers of the return modes).
@@ -105,7 +105,7 @@ def make_command(code: str, **more: Any) -> Command:
 
 
 def make_commands(rates: tuple[int, int]) -> Mapping[str, Command]:
-    """Return the commands of a unit; `rates` are the lowest and highest speed in rpm."""
+    """Return the commands of a sensor; `rates` are the lowest and highest speed in rpm."""
     return {
         "get_calibration": make_command(
             "get_calibration", learns=lambda reply: {"calibration": bytes(reply.payload)}

@@ -10,7 +10,7 @@ packet is at the time of the packet, as in the driver.
 
 The clock is read as a date and nanoseconds, which the sensor sends if it is synchronized by GPS.
 The times of PTP and NTP are sent in other units and are not supported. The configuration of the
-sensor and the measured angles of a unit are not supported either.
+sensor and the measured angles of a sensor are not supported either.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Ouster OS0, OS1, OS2 and OSDome: columns of pixels over UDP.
 
-The layout of packets and the directions of beams are read from the metadata of the unit. The
+The layout of packets and the directions of beams are read from the metadata of the sensor. The
 metadata are in a file (`configure(metadata=path)`), or are requested from the sensor's web server
 when the sensor is opened. Without metadata, the user can pass a layout (`rows`, `turn`, `profile`),
 and the angles are the nominal angles of an ideal sensor.
@@ -63,11 +63,11 @@ MODELS = {
 }
 #: The pixel fields that become columns in `extra`.
 EXTRA_FIELDS = ("signal", "near_ir", "flags", "window", "zone_mask", "red", "green", "blue")
-METADATA_ONLY = "both models send the same packets; the metadata name the model"
+METADATA_ONLY = "both models send the same packets; only the metadata tell which model it is"
 
 
 def points(f: Fields, unit: Unit) -> Polar:
-    """Return the points of the pixels, calculated with the beams of the unit."""
+    """Return the points of the pixels, calculated with the beams of the sensor."""
     columns = f.columns
     bits = PROFILES[unit.profile]
     names = dict.fromkeys(name for name in bits if name[0] != "_" and name[-1] != "2")
@@ -137,7 +137,7 @@ def sweep(unit: Unit, i: int) -> dict[str, Any]:
 
 
 def apply_unit(sensor: Sensor, unit: Unit) -> Sensor:
-    """Return the sensor with the layout and the beams of a unit."""
+    """Return the sensor with the layout and the beams of a sensor."""
     rotation = tuple(map(tuple, unit.imu[:3, :3].tolist()))
     frames = {
         "data": make_lidar_frame(unit.profile, unit.rows, unit.columns, unit.turn),
@@ -210,10 +210,10 @@ def configure(
     turn: int | None = None,
     profile: str | None = None,
 ) -> Sensor:
-    """Return the sensor with the layout and the beams of a unit.
+    """Return the sensor with the layout and the beams of a sensor.
 
     Args:
-        metadata: the unit's JSON file, as its web server returns it at /api/v1/sensor/metadata.
+        metadata: the sensor's JSON file, as its web server returns it at /api/v1/sensor/metadata.
         rows: the number of pixels per column of a nominal unit, 16 to 128.
         turn: the number of columns per revolution of a nominal unit, 512 to 4096.
         profile: the packing of pixels of a nominal unit, such as RNG19_RFL8_SIG16_NIR16.

@@ -1,4 +1,4 @@
-"""The layout of a unit's packets and the directions of its beams, from its metadata (JSON).
+"""The layout of a sensor's packets and the directions of its beams, from its metadata (JSON).
 
 Source: ouster-sdk (metadata.cpp, xyzlut.cpp). Files of firmware up to 2.4 have no sections. Later
 files, and metadata from the sensor's web server, have sections. Both formats are read.
@@ -81,7 +81,7 @@ class Unit:
         samples: samples per IMU packet; 0 for LEGACY packets.
         product, serial: the product line and the serial number in the metadata; "" if missing.
         timestamp_mode: the source of the time, a key of `TIME_EPOCHS`; "" if unknown.
-        nominal: whether values of the model replace missing values of the unit.
+        nominal: whether values of the model replace missing values of the individual sensor.
     """
 
     profile: str
@@ -215,7 +215,7 @@ class MetadataKeys:
     data: Mapping[str, Any]
 
     def to_unit(self) -> Unit:
-        """Return the unit that the metadata describe.
+        """Return the individual sensor that the metadata describe.
 
         Raises:
             UsageError: if a key is missing or has an invalid value.

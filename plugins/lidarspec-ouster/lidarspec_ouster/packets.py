@@ -5,7 +5,7 @@ All values are little-endian.
     header | 16 columns: column header, H pixels, column footer | footer
     (LEGACY has no header and no footer)
 
-The number of pixels per column and their packing are in the metadata of the unit, not in the
+The number of pixels per column and their packing are in the metadata of the sensor, not in the
 packets.
 
 Source: ouster-sdk, parsing.cpp. The bits of LEGACY, RNG19 (single and dual) and RNG15 are verified

@@ -1,6 +1,6 @@
 """RoboSense RS-Helios: rotating lidars of 16 and of 32 lasers over UDP.
 
-The angles of a unit are in its device information (DIFOP).
+The angles of a sensor are in its device information (DIFOP).
 
 Source: RS-Helios-16P user manual: 5.4.2 (return modes), 6.2 and Table 9 (MSOP), 6.3 and Table 11
 (DIFOP), appendix B.3 to B.13 (registers). From the vendor's rs_driver (decoder_RSHELIOS.hpp,

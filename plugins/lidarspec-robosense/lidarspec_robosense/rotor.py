@@ -1,7 +1,7 @@
 """The parts that the rotating lidars share: clocks, temperatures, DIFOP, and points.
 
 DIFOP, the device information, contains the configured speed, the return mode and the angles of each
-laser of the unit. It has three layouts. RS-LiDAR-16, -32 and RS-Bpearl have the first layout, and
+laser of the sensor. It has three layouts. RS-LiDAR-16, -32 and RS-Bpearl have the first layout, and
 Helios has the second. The layout of the Ruby family begins like the second layout and ends like the
 first layout, with 128 lasers.
 
@@ -232,10 +232,10 @@ class RotorModel:
         delay: the seconds from the time of the block to the firing of each laser, (slots,), or
             (blocks, slots) if blocks contain different lasers.
         period: the seconds from one firing of all lasers to the next.
-        lens_distance: the distance in metres from the axis to the optical centre, in the direction
-            of the rotor.
-        vertical, horizontal: (lasers,) the nominal angles in degrees, which are used until DIFOP
-            with the angles of the unit arrives.
+        lens_distance: the distance in metres from the axis to the optical centre, along the
+            azimuth of the block.
+        vertical, horizontal: (lasers,) the nominal angles in degrees, which are used until a DIFOP
+            packet with the measured angles arrives.
         height: the height of the optical centre above the origin, metres.
     """
 

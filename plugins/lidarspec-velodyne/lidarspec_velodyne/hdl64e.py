@@ -6,7 +6,7 @@ in db.xml), which cite the vendor's manuals. Blocks with 0xFFEE contain lasers 1
 with 0xFFDD lasers 33 to 64 of the same firing. With dual return, four consecutive blocks have the
 same azimuth (velodyne_decoder); the first two contain the strongest return.
 
-Each laser of each unit has its own corrections. The corrections are in the unit's file (db.xml),
+Each laser of each unit has its own corrections. The corrections are in the sensor's file (db.xml),
 and are also sent in `status_value`, one byte in each packet. The corrections in this module are
 those of an example unit. Clouds are marked as nominal, unless the sensor is configured with the
 unit's file, as in `configure(calibration=...)`. Three things are not supported: the second
@@ -235,7 +235,7 @@ def configure(unit: UnitCalibration, sensor: Sensor, /, *, calibration: str | Pa
     """Return the sensor with the corrections of one unit.
 
     Args:
-        calibration: the unit's file db.xml, in degrees and centimetres.
+        calibration: the sensor's file db.xml, in degrees and centimetres.
 
     Raises:
         UsageError: if the file cannot be read, or does not contain each of the 64 lasers exactly
