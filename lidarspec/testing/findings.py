@@ -108,7 +108,7 @@ LS504 angles run backwards across the full circle | once per turn, a packet is s
 LS505 an angle of one full circle is not treated as 0 | sensors send 360.00 degrees for 0
       | use wrap(angle, 360.0), or reject it in `plausible`
 LS506 angles are not in the order of the rotation | scans are cut at wrong angles | use the manual's direction, and spread or wrap
-LS507 decoding does not return the simulated scene | `sweep` and `points` contradict each other | make `sweep` the inverse of `points`
+LS507 decoding does not return the simulated scene | `sweep` and `points` contradict each other | make `sweep` the inverse of `points`; if `points` rejects weak returns, give their intensity in `sweep`
 LS508 `sweep` cannot be simulated | sim, demo and virtual_port fail
       | return the physical values of packet i, by field path
 LS509 the clock runs backwards when it wraps | durations become negative | declare Clock(..., wraps_at=) in seconds
@@ -141,7 +141,7 @@ LS710 the status requires vectors | no frame of a real sensor has been tested
 LS711 no vector gives the value of this field | a wrong byte order, scale or offset would not be noticed
       | add it to `values` or `units`, once with a value other than 0
 LS712 all points of the vectors are in one quadrant | a mirrored or rotated cloud would pass
-      | add points in two quadrants, calculated by hand
+      | add points in two quadrants, calculated by hand; acknowledge this for a sensor with a single beam
 LS713 a vector exceeds the range limits | its byte order, its scale or the limit is wrong
       | compare byte order, scale and range_limits with the manual
 LS801 an exception is ignored without a message | errors are neither reported nor counted | remove the try
