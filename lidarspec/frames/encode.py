@@ -128,6 +128,8 @@ class _Encoder:
     def _measure_texts(self) -> None:
         """Find the sizes of the texts that end at an end mark or with the datagram."""
         for path, ending in self._schema.endings.items():
+            if ending.size.axes:
+                continue  # the text is in a part, whose own encoder measures it
             info = self._schema.fields[path]
             shown = self._make_shown_path(path)
             value = get_member(self._given, path, None)

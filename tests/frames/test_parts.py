@@ -7,7 +7,19 @@ import random
 from typing import Any
 
 import pytest
-from construct import Array, Bytes, Const, Int8ub, Int16ub, Int32ub, Struct, this
+from construct import (
+    Array,
+    Bytes,
+    Const,
+    CString,
+    GreedyBytes,
+    Int8ub,
+    Int16ub,
+    Int32ub,
+    NullTerminated,
+    Struct,
+    this,
+)
 
 import lidarspec as ls
 from lidarspec import Sensor, SpecError, UsageError, WireError
@@ -312,6 +324,22 @@ def test_a_wrong_length_in_a_part_is_reported_with_its_place() -> None:
         sensor.parse(bytes(data))
     found = fault.value
     assert (found.path, found.offset, found.expected, found.got) == ("parts[1].size", 8, 4, 9)
+
+
+def test_parts_with_texts_that_end_at_a_mark_are_built() -> None:
+    name = Struct("type" / Const(1, Int8ub), "name" / CString("ascii"))
+    raw = Struct("type" / Const(2, Int8ub), "raw" / NullTerminated(GreedyBytes))
+    struct = Struct(
+        "size" / Int8ub,
+        "title" / CString("ascii"),
+        "parts" / Parts({"name": name, "raw": raw}, within=this.size),
+    )
+    sensor = against_construct.sensor(struct)
+    data = sensor.build("data", title="t", parts=[{"name": "abc"}, {"raw": b"z"}, {"name": ""}])
+    assert data == b"\x0at\0" + b"\1abc\0" + b"\2z\0" + b"\1\0"
+    assert sensor.build("data", sensor.parse(data)) == data
+    with pytest.raises(UsageError, match=r"parts\[0\].raw: expected bytes without 00, got b'a"):
+        sensor.build("data", title="", parts=[{"raw": b"a\0b"}])
 
 
 def test_both_engines_count_unknown_parts_equally() -> None:
