@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import SpecError
 from lidarspec.frames.encode import find_kind, set_count
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows
-from lidarspec.frames.layout import Layout
+from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.frames.layout_tree import InvalidLengthError, UnknownSelectorError, find_layout
 from lidarspec.frames.schema import make_schema, without_indices
 from lidarspec.frames.wire_coder import Coder, frame_coder
@@ -115,11 +115,14 @@ class FrameMaker:
         of a part is a mapping of field paths to values.
 
         Raises:
-            SpecError: if a value is given for a field that the frame does not have.
+            SpecError: if a value is given for a field that the frame does not have, or a value does
+                not fit its field.
         """
         members: dict[int, tuple[Layout, list[int]]] = {}
         if self._decoded or self.schema.endings:
             frames = [self._encode_texts(values) for values in frames]
+        for values in frames:
+            self._check_numbers(values)
         counted = [self._with_counts(values) for values in frames] if self._counts else frames
         if self.schema.parts:
             filled = [self._with_parts(values) for values in counted]
@@ -191,6 +194,35 @@ class FrameMaker:
             missing = b"\0" if ending.is_content else b""
             result[ending.size.path] = len(result.get(path, missing))
         return result
+
+    def _check_numbers(self, values: Values) -> None:
+        """Raise an error if the value of a field of numbers is not a number or an array."""
+        for path, value in values.items():
+            info = self.schema.fields.get(path)
+            if info is None or isinstance(value, int | float | bytes):
+                continue
+            try:
+                shape = np.asarray(find_code(info, value), np.float64).shape
+            except (TypeError, ValueError):
+                raise self._make_value_error(path, f"{value!r:.60}, expected numbers") from None
+            if value is None:
+                raise self._make_value_error(path, "None, expected numbers")
+            if len(shape) > len(info.axes):
+                expected = f"at most {len(info.axes)} axes" if info.axes else "a single number"
+                raise self._make_value_error(path, f"values of shape {shape}, expected {expected}")
+
+    def _check_lengths(self, leaf: Leaf, value: Any) -> None:
+        """Raise an error if a value is an array whose lengths differ from those of its field."""
+        for axis, expected, length in zip(
+            leaf.info.axes, leaf.shape, np.shape(value), strict=False
+        ):
+            if length not in (1, expected):
+                raise self._make_value_error(
+                    leaf.info.path, f"{length} values, but {axis} has {expected} elements"
+                )
+
+    def _make_value_error(self, path: str, what: str) -> SpecError:
+        return SpecError(f"sweep returns {what}", path=path, sensor=self._sensor)
 
     def _with_counts(self, values: Values) -> Values:
         """Return the values of a frame, completed by the counts of its arrays."""
@@ -305,6 +337,8 @@ class FrameMaker:
                     sensor=self._sensor,
                 )
             given = [find_code(leaf.info, values.get(path, 0)) for values, _ in frames]
+            for value in given:
+                self._check_lengths(leaf, value)
             leaf.store(rows, leaf.raw(given))
         for axis, region in layout.regions.items():
             parts = b"".join(made[axis] for _, made in frames)

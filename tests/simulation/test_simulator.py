@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -516,3 +517,31 @@ def test_an_intensity_that_sweep_gives_stays() -> None:
     assert made.decode(simulate(made, 2)).points().intensity.tolist() == [7, 8, 9] * 2
     free = replace(made, simulation=Simulation(lambda i: {}, rate=10))
     assert 0 < free.decode(simulate(free, 2)).points().intensity.min() != 7
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ({"count": 3}, "samples.distance: sweep returns 4 values, but samples has 3 elements"),
+        ({"count": [4, 4]}, "count: sweep returns values of shape (2,), expected a single number"),
+        ({"count": "four"}, "count: sweep returns 'four', expected numbers"),
+        ({"count": None}, "count: sweep returns None, expected numbers"),
+        (
+            {"samples.distance": np.ones((4, 2))},
+            "samples.distance: sweep returns values of shape (4, 2), expected at most 1 axes",
+        ),
+    ],
+)
+def test_values_of_a_sweep_that_do_not_fit_their_field_are_spec_errors(
+    given: dict[str, Any], reason: str
+) -> None:
+    sample = Struct("distance" / Scaled(Int8ub, 0.05, "m"))
+    frame = Struct("count" / Int8ub, "samples" / Array(this.count, sample))
+    values = {"count": 4, "samples.distance": [1, 2, 3, 4], **given}
+    made = replace(
+        against_construct.sensor(frame),
+        points=lambda f: Polar(range=f.samples.distance, azimuth=f.samples.index),
+        simulation=Simulation(lambda i: values, rate=10),
+    )
+    with pytest.raises(SpecError, match=re.escape(f": {reason}")):
+        simulate(made, 2)
