@@ -326,6 +326,7 @@ class Registry:
 
     def _add_offered(self, entry: EntryPoint, sensor: Any) -> list[str]:
         """Store the sensor of an entry point, and return a list with the sensor's id."""
+        require_sensor(entry, sensor)
         self._check(sensor, [sensor])
         home = (entry.distribution, entry.module)
         names = {other.name for other in self._offered[home] if other.value == entry.value}
@@ -606,6 +607,23 @@ class Registry:
                     sensor=name,
                     rule="LS005",
                 )
+
+
+def require_sensor(entry: EntryPoint, value: Any) -> None:
+    """Check that an entry point of `lidarspec.sensors` names a sensor.
+
+    Args:
+        value: the object that the entry point names.
+
+    Raises:
+        SpecError: if the object is not a `Sensor`.
+    """
+    if not isinstance(value, Sensor):
+        raise SpecError(
+            f"an entry point of {SENSORS} must name a Sensor, but {entry.value} has the"
+            f" type {type(value).__name__}",
+            rule="LS007",
+        )
 
 
 def make_row(sensor: Sensor, distribution: str, version: str) -> KnownSensor:

@@ -24,6 +24,7 @@ from lidarspec.plugins import (
     import_file,
     no_sensors_error,
     registry,
+    require_sensor,
     split_file_and_id,
 )
 from lidarspec.sensor_operations import Sensor
@@ -177,9 +178,13 @@ def _find_entry_points(distribution: str) -> list[EntryPoint]:
 
 def _find_distribution_target(entries: list[EntryPoint]) -> CheckTarget:
     target = CheckTarget()
+    sensor_entries = entry_points(SENSORS)
     for entry in entries:
         try:
-            sensors = _load_sensors(entry.load(), entry.value)
+            plugin = entry.load()
+            if entry in sensor_entries:
+                require_sensor(entry, plugin)
+            sensors = _load_sensors(plugin, entry.value)
         except (Exception, SystemExit) as error:
             finding = describe_loading_error(error, find_module_files(entry.value))
             target.findings.append(

@@ -274,7 +274,10 @@ def test_the_first_of_two_plugins_with_one_id_wins(
             "liar-x1: the name of an entry point must be the id or an alias of its sensor, not"
             " 'liar-x2' (liar:liar_x2)",
         ),
-        ("odd-x1 = odd", "lidarspec_sensors must return sensors, got int"),
+        (
+            "odd-x1 = odd",
+            "must name a Sensor, but odd:odd_x1 has the type int",
+        ),
         ("gone-x1 = a_module_that_nobody_has", "ModuleNotFoundError"),
         ("acme-x7 = acme", "AttributeError"),
     ],

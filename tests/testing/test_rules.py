@@ -158,3 +158,19 @@ def test_a_sensor_whose_plugin_does_not_load_is_checked_as_its_distribution(
     (finding,) = check.find_target("acme-x1").findings
     assert (finding.code, finding.line) == ("LS001", 1)
     assert "ZeroDivisionError" in finding.what
+
+
+def test_an_entry_point_that_names_no_sensor_is_a_finding(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "acme_renamed.py").write_text("DATA = {}\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    entry = EntryPoint("acme-x1", "acme_renamed:DATA", "lidarspec-acme", "1.0")
+    broken = Registry(offered=[entry])
+    monkeypatch.setattr(check, "registry", lambda: broken)
+    monkeypatch.setattr(check, "entry_points", lambda group: [entry] if group == SENSORS else [])
+    for name in ("acme-x1", "lidarspec-acme"):
+        (report,) = check.iter_reports(check.find_target(name), name)
+        (finding,) = report.findings
+        assert (finding.code, finding.path) == ("LS007", "acme-x1 = acme_renamed:DATA")
+        assert finding.what.endswith("acme_renamed:DATA has the type dict")
