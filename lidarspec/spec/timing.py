@@ -204,8 +204,8 @@ class Clock:
             it.
 
     Raises:
-        SpecError: if `wraps_at` is not positive or longer than 292 years, or if the epoch is
-            unknown.
+        SpecError: if `wraps_at` is not positive or longer than 292 years, if `pace` is not a
+            function, or if the epoch is unknown.
     """
 
     source: Source
@@ -221,6 +221,12 @@ class Clock:
             raise SpecError(
                 f"a clock that counts from the full hour must wrap at {HOUR_S} s",
                 path="clock.wraps_at",
+            )
+        if self.pace is not None and not callable(self.pace):
+            raise SpecError(
+                "the pace must be a function of Fields that returns seconds, such as lambda f:"
+                f" {self.pace!r}, not {self.pace!r}",
+                path="clock.pace",
             )
         if self.wraps_at is None:
             return

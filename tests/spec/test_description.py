@@ -31,6 +31,11 @@ BYTE = Struct("value" / Int8ub)
             "clock.wraps_at: expected a positive number of seconds, got 0",
         ),
         (
+            lambda: Clock("time", pace=0.01),  # type: ignore[arg-type]
+            "clock.pace: the pace must be a function of Fields that returns seconds, such as"
+            " lambda f: 0.01, not 0.01",
+        ),
+        (
             lambda: Frame(BYTE, simulation=None),
             "simulation: expected a Simulation(...), got None",
         ),  # type: ignore[arg-type]
