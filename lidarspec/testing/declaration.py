@@ -414,6 +414,8 @@ def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
             for start, end in checksum.spans
             for byte in range(start, end)
         }
+        if not under:
+            continue  # all fields that the checksum covers are empty in this layout
         checksum_paths = {
             leaf.info.path for checksum in layout.checksums for leaf in checksum.leaves
         }

@@ -32,6 +32,7 @@ from lidarspec.spec import (
     Scaled,
     Simulation,
     Sum,
+    Udp,
     Xor,
 )
 from lidarspec.testing import check
@@ -43,6 +44,8 @@ from lidarspec.testing.properties import PROPERTIES
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 from lidarspec.testing.vectors import every_checksum_is_checked
 from tests.broken import interpreted, sound
+
+BROKEN = Path(__file__).resolve().parents[1] / "broken"
 
 
 def declared_codes(sensor: Sensor) -> set[str]:
@@ -174,3 +177,37 @@ def test_an_entry_point_that_names_no_sensor_is_a_finding(
         (finding,) = report.findings
         assert (finding.code, finding.path) == ("LS007", "acme-x1 = acme_renamed:DATA")
         assert finding.what.endswith("acme_renamed:DATA has the type dict")
+
+
+def test_uncovered_fields_are_found_if_the_covered_field_may_be_empty() -> None:
+    struct = Struct(
+        "header" / Const(b"\xaa\x55\xc3"),
+        "count" / Int8ul,
+        "levels" / Array(this.count, Int8ul),
+        "flags" / Int16ul,
+        "sum" / Int16ul,
+    )
+    checked = Checksummed(struct, field="sum", algorithm=Sum(16), over=("levels",))
+    sensor = Sensor(
+        "acme-x1",
+        vendor="Acme",
+        model="X1",
+        frames={"data": Frame(checked, max_length=9)},
+        links={"data": Udp(2368)},
+        status="manual",
+        source="manual",
+    )
+    subject = SensorUnderTest(sensor)
+    assert any(not subject.example("data", seed=seed)[3] for seed in range(3))
+    findings = check_declaration(subject)
+    assert [(finding.code, finding.path) for finding in findings] == [("LS205", "data.flags")]
+
+
+def test_a_report_counts_the_checks_that_a_fatal_finding_stops() -> None:
+    (report,) = check.iter_reports(
+        check.find_target(BROKEN / "no_example.py"), "no_example", examples=4
+    )
+    assert {finding.code for finding in report.findings} == {"LS301"}
+    assert report.held == 0
+    assert len(report.skipped) == len(PROPERTIES) - 1
+    assert report.skipped["replies_can_match"] == "not tested because of LS301"
