@@ -568,8 +568,6 @@ def _is_short_write(call: ast.Call, *, sockets: bool) -> bool:
 
 #: Rules whose violation makes it impossible to test properties.
 FATAL_RULES = frozenset({"LS213", "LS114", "LS115", "LS301"})
-#: Key in `Report.skipped` for all properties that are skipped after a violation of `FATAL_RULES`.
-REMAINING_PROPERTIES = "all other properties"
 
 
 #: Called with the name of the current step, the number of finished properties and the total number
@@ -708,8 +706,12 @@ def _make_report(
         )
         report.held += not findings
         report.findings += findings
-        if any(finding.code in FATAL_RULES for finding in report.findings):
-            report.skipped[REMAINING_PROPERTIES] = "not tested until these findings are fixed"
+        fatal = sorted({finding.code for finding in report.findings} & FATAL_RULES)
+        if fatal:
+            report.skipped |= {
+                remaining.name: f"not tested because of {', '.join(fatal)}"
+                for remaining in PROPERTIES[done + 1 :]
+            }
             is_whole = False
             break
     distinct = list(
