@@ -162,6 +162,12 @@ class DeviceClock:
                 jumps.append(jump)
         return jumps
 
+    def forget_offset(self) -> None:
+        """Forget the offset of the clock, but not the drift."""
+        self._min_delays.clear()
+        self._outliers.clear()
+        self._last_stamped = None
+
     def stamp(self, device_ns: int, host_ns: int) -> int:
         """Return the time of a scan by the host's clock, ns.
 
@@ -248,7 +254,7 @@ class DeviceClock:
             and sample.host - self._min_delays[-1].host > self._parts * PART_NS
         )
         if has_paused and abs(deviation) < UNSETTLED_LIMIT_NS:
-            self._forget_offset()  # the drift is not known well enough for such a pause
+            self.forget_offset()  # the drift is not known well enough for such a pause
         early_limit = UNSETTLED_LIMIT_NS
         late_limit = UNSETTLED_LIMIT_NS
         if self.is_settled:
@@ -264,12 +270,6 @@ class DeviceClock:
         if self._was_set(sample.host - self._first_outlier_ns):
             return self._restart_at_outliers()
         return None
-
-    def _forget_offset(self) -> None:
-        """Forget the offset of the clock, but not the drift."""
-        self._min_delays.clear()
-        self._outliers.clear()
-        self._last_stamped = None
 
     def _find_deviation(self, sample: ClockSample) -> int:
         """Return how much later a sample arrived than a packet on the line, ns."""
@@ -306,7 +306,7 @@ class DeviceClock:
         delay_after = min(sample.delay for sample in outliers)
         jump = ClockJump(delay_before - delay_after, self._first_outlier_ns)
         self.jump = jump
-        self._forget_offset()
+        self.forget_offset()
         for sample in outliers:
             self._update_line(sample)
         return jump

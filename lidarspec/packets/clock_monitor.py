@@ -165,8 +165,15 @@ class ClockMonitor:
         except Exception as error:  # the plugin's functions
             packets.stats.count_error(PluginError.of(error, "clock"), len(packets))
             return []
-        self._device_ns = packets.time_ns.item(-1)
         known = packets.host_ns > 0
+        had_date = self._has_date
+        self._device_ns = packets.time_ns.item(-1)
+        if clock.reference is not None and self._has_date and not had_date:
+            # The first date is added to the times by lidarspec; the sensor's clock does not step.
+            self._estimate.forget_offset()
+            self._forget_delays()
+            self.samples.clear()
+            known &= packets.time_ns >= FIRST_DATE_NS
         if known.any():
             for piece in split_runs(packets.host_ns[known] // PIECE_NS):
                 which = np.flatnonzero(known)[piece]
@@ -254,8 +261,7 @@ class ClockMonitor:
         """Update the estimate with consecutive packets, and return the clock's jumps."""
         jumps = self._estimate.observe(device, host)
         if jumps:
-            self._delays = self._delays[:0]
-            self._late_uncertain = 0
+            self._forget_delays()
         delays = self._estimate.delays_above_line(device, host)
         self._late_uncertain += int(np.count_nonzero(delays > LATE_NS))
         if not self._estimate.is_uncertain:
@@ -271,6 +277,11 @@ class ClockMonitor:
             sample = OffsetSample(self._host_ns, self._offset_s, self._find_jitter_ms())
             self.samples.append(sample)
         return jumps
+
+    def _forget_delays(self) -> None:
+        """Forget the delays of packets, because the offset of the clock has changed."""
+        self._delays = self._delays[:0]
+        self._late_uncertain = 0
 
     def _name_jump(self, jump: ClockJump) -> ClockFinding:
         """Return the event that caused a jump of the clock."""

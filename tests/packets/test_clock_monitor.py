@@ -10,10 +10,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import lidarspec as ls
 from lidarspec.explaining.clock_text import iter_clock_rows
 from lidarspec.packets.clock_findings import FINDING_TYPES, ClockFinding
 from lidarspec.packets.clock_monitor import ClockMonitor
-from tests.clock_runs import RATE_HZ, SYNCED, TAI_S, Run, make_run, watch
+from tests.clock_runs import BEGAN_S, RATE_HZ, SYNCED, TAI_S, Run, make_run, watch
 from tests.shapes import SHAPES
 from tests.shapes.synced import HOLDOVER
 
@@ -180,6 +181,24 @@ def test_pieces_of_any_length_give_the_same_report(piece: int) -> None:
     report = monitor.report()
     assert report.drift_ppm == pytest.approx(30, abs=3)
     assert report.error_s == pytest.approx(20 * 30e-6, abs=1e-3)
+
+
+@pytest.mark.parametrize("undated", [1, 100, 3000])
+def test_the_first_date_of_a_clock_is_no_step(undated: int) -> None:
+    """A live VLP-16 sends its date in another frame, which may arrive after the first packets."""
+    sensor = ls.sensor("velodyne-vlp16")
+    packets = sensor.decode(ls.simulate(sensor, 4000))
+    date_ns = int(BEGAN_S) * 10**9  # at a full hour, when the clock begins at 0
+    packets.host_ns = packets.time_ns + date_ns
+    packets.time_ns = np.where(np.arange(len(packets)) < undated, 0, date_ns) + packets.time_ns
+    monitor = ClockMonitor(sensor)
+    for start in range(0, len(packets), 70):
+        assert monitor.add(packets.take(slice(start, start + 70))) == []
+    report = monitor.report()
+    assert report.verdict.code == "ok"
+    assert report.jumps == report.late == 0
+    assert report.offset_s == pytest.approx(0, abs=1e-3)
+    assert all(abs(sample.offset_s) < 1e-3 for sample in monitor.samples)
 
 
 def test_a_sensor_without_a_clock_is_no_fault() -> None:
