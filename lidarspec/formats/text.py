@@ -31,13 +31,13 @@ _GZIP_LEVEL = 1
 
 @contextlib.contextmanager
 def open_text_file(path: Path, *, is_zipped: bool = False) -> Iterator[Callable[[str], None]]:
-    """Open a text file, and yield a function that writes to it in a thread."""
+    """Open a text file in UTF-8, and yield a function that writes to it in a thread."""
     with contextlib.ExitStack() as files:
         file: Any = files.enter_context(path.open("wb"))
         if is_zipped:
             # Without a name and a time, equal content gives equal files.
             file = files.enter_context(gzip.GzipFile("", "wb", _GZIP_LEVEL, file, mtime=0))
-        text = files.enter_context(io.TextIOWrapper(file, encoding="ascii", newline=""))
+        text = files.enter_context(io.TextIOWrapper(file, encoding="utf-8", newline=""))
         yield files.enter_context(write_in_thread(text.write))
 
 

@@ -227,6 +227,15 @@ def test_texts_are_values_in_every_verb(tmp_path: Path) -> None:
     assert "acme-logger: clean" in ran("check", plugin, "--max-examples", "5").stdout
 
 
+def test_texts_that_are_not_ascii_become_csv(tmp_path: Path) -> None:
+    plugin, data, table = (tmp_path / name for name in ("logger.py", "made.bin", "made.csv"))
+    source = LOGGER.replace('CString("ascii")', 'CString("utf8")').replace('"x"', '"\u00eb"')
+    plugin.write_text(source, encoding="utf-8")
+    ran("sim", plugin, "--to", data, "-t", "0.25s")
+    ran("convert", data, table, "-s", plugin, "-f", "report")
+    assert "0,A1,\u00eb,100,0," in table.read_text(encoding="utf-8").splitlines()
+
+
 TAGS = RECEIVER.with_name("tags.py")
 TAGS_BYTES = 8  # in each frame of `tags_file`
 
