@@ -101,7 +101,7 @@ def _parse_number(text: str, unit: str, place: str, expected: str) -> tuple[Frac
     Args:
         unit: the unit to convert to, if the text has a unit.
     """
-    digits, unit_text = split_unit(text)
+    digits, unit_text = split_unit(text, unit)
     if unit_text:
         per_unit = factor(unit_text, unit)
     else:

@@ -50,7 +50,7 @@ HttpReply = Struct(
     "mark" / Const(b"HTTP"), "status" / Int16ub, "size" / Int32ub, "body" / Bytes(this.size)
 )
 #: target unit -> unit -> size of the unit in target units. Only units that a user may type on the
-#: command line are included.
+#: command line instead of the unit of a field are included.
 _FACTORS: dict[str, dict[str, Fraction]] = {
     "m": {"m": Fraction(1), "cm": Fraction(1, 100), "mm": Fraction(1, 1000)},
     "s": {
@@ -79,13 +79,16 @@ def is_unit(unit: str) -> bool:
     return any(unit in table for table in _FACTORS.values())
 
 
-def split_unit(text: str) -> tuple[str, str]:
+def split_unit(text: str, own_unit: str = "") -> tuple[str, str]:
     """Split a text such as "324.27deg" into number and unit.
 
     The unit is "" for a bare number.
+
+    Args:
+        own_unit: a unit to accept in addition to the units that can be converted.
     """
-    known = sorted({unit for table in _FACTORS.values() for unit in table}, key=len, reverse=True)
-    for unit in known:
+    units = {own_unit, *(unit for table in _FACTORS.values() for unit in table)} - {""}
+    for unit in sorted(units, key=len, reverse=True):
         if text.endswith(unit) and _is_number(text[: -len(unit)]):
             return text[: -len(unit)].strip(), unit
     return text, ""

@@ -274,6 +274,15 @@ def test_build_fills_arrays_and_later_values_win() -> None:
     assert frame.points[3].intensity == 7
 
 
+def test_build_takes_the_unit_of_every_field() -> None:
+    words = ("distance=3m", "strength=500", "temperature=25.5degC")
+    built = ran("build", "benewake-tfmini", "data", *words).stdout
+    frame = ls.sensor("benewake-tfmini").parse(bytes.fromhex(built))
+    assert frame.temperature == (25.5 + 256) * 8
+    refused = ran("build", "benewake-tfmini", "data", "temperature=25.5", code=2).stderr
+    assert "give it a unit: 25.5degC" in refused
+
+
 def test_build_takes_the_length_of_an_array_from_its_count_or_its_elements() -> None:
     common = ("mt.m=55", "mt.start=0", "fsa.angle=10deg", "lsa.angle=12deg")
     every = ("samples[*].distance=1m", "samples[*].intensity=3", "samples[*].exposure=1")
