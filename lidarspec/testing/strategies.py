@@ -31,11 +31,13 @@ from lidarspec.frames.parse import parse
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.framing.example_frames import LOW_NUMBERS, draw_frame, iter_switch_keys
 from lidarspec.framing.frame_engine import get_codec
+from lidarspec.packets.stream import PacketStream
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scan import Scan
+from lidarspec.scans.stream import iter_scans
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.scenes import Box, Room
-from lidarspec.simulation.simulator import make_opening_frame, simulate
+from lidarspec.simulation.simulator import frame_simulation, make_opening_frame, simulate
 from lidarspec.spec.arguments import Address, Choice, Range, Taken, Text
 from lidarspec.spec.syntax import check_bound
 from lidarspec.spec.tree import FieldInfo
@@ -278,8 +280,8 @@ def _count_packets_until_scan(sensor: Sensor) -> int:
     """Return a number of packets, from power-on, that contain a complete scan."""
     count = FIRST_PACKETS
     while count <= MAX_PACKETS:
-        packets = simulate(sensor, count)
-        if any(scan.complete for scan in sensor.scans(_join_frames(sensor, packets))):
+        sent = dict(enumerate(simulate(sensor, count)))
+        if any(scan.complete for scan in _find_scans(sensor, sent)):
             return count
         count *= 2
     raise SpecError(
@@ -296,10 +298,10 @@ def _scans(draw: DrawFn, sensor: Sensor, packets: int, lost: int) -> Scan:
     )
     room = Room(walls, tuple(draw(st.lists(_boxes(), max_size=MAX_BOXES))))
     start = draw(st.integers(0, MAX_SCANS)) * packets
-    sent = simulate(sensor, packets, start=start, scene=room)
-    for index in sorted(draw(st.sets(st.integers(0, packets - 1), max_size=lost)), reverse=True):
+    sent = dict(enumerate(simulate(sensor, packets, start=start, scene=room)))
+    for index in draw(st.sets(st.integers(0, packets - 1), max_size=lost)):
         del sent[index]
-    all_scans = list(sensor.scans(_join_frames(sensor, sent)))
+    all_scans = _find_scans(sensor, sent)
     complete = [scan for scan in all_scans if scan.complete]
     if not all_scans:
         reject()
@@ -319,12 +321,33 @@ def _boxes(draw: DrawFn) -> Box:
     return Box((min(x), min(y), -1.0), (max(x), max(y), draw(st.integers(-9, 10)) / 10))
 
 
-def _join_frames(sensor: Sensor, packets: list[bytes]) -> Any:
-    """Return data frames as the data link transmits them."""
-    announced = [make_opening_frame(sensor), *packets]
+def _find_scans(sensor: Sensor, packets: Mapping[int, bytes]) -> list[Scan]:
+    """Return the scans of data frames.
+
+    Args:
+        packets: number -> data frame, in order; numbers of lost frames are missing.
+    """
+    opening = make_opening_frame(sensor)
+    if sensor.clock is None:
+        return _find_scans_by_arrival(sensor, opening, packets)
+    announced = [opening, *packets.values()]
     if sensor.datagrams:
-        return [data for data in announced if data]
-    return b"".join(announced)
+        return list(sensor.scans([data for data in announced if data]))
+    return list(sensor.scans(b"".join(announced)))
+
+
+def _find_scans_by_arrival(
+    sensor: Sensor, opening: bytes, packets: Mapping[int, bytes]
+) -> list[Scan]:
+    """Return the scans of data frames that arrive at the rate of the simulated sensor."""
+    interval_ns = frame_simulation(sensor, sensor.data_frame).interval
+    decoder = sensor.decoder()
+    found = decoder.frames(opening, 0) if opening else []
+    for number, data in packets.items():
+        found += decoder.frames(data, round(number * interval_ns))
+    found += decoder.take_pending()
+    stream = PacketStream(sensor, sensor.data_frame, decoder.stats)
+    return list(iter_scans(sensor, [stream.add(found, whole=True)]))
 
 
 def _find_sensor(sensor: str | Sensor) -> Sensor:

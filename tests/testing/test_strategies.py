@@ -229,6 +229,14 @@ def test_the_simplest_scan_is_an_empty_room() -> None:
     assert all(len(scan) for scan in draw_examples(scans(sensor), 3))
 
 
+def test_scans_without_a_clock_end_by_arrival_times() -> None:
+    sensor = load_sensor("benewake-tfmini")  # sends one point every 10 ms
+    (scan,) = draw_examples(scans(sensor, lost=0), 1)
+    assert scan.complete
+    assert len(scan) == 10
+    assert all(len(scan) for scan in draw_examples(scans(sensor), 3))
+
+
 def test_unknown_names_are_refused_at_once() -> None:
     sensor = commands_shape.SENSOR
     with pytest.raises(UnknownFrame):
