@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Scene
+from lidarspec.spec.timing import Every
 from lidarspec.transports.destinations import make_simulated_outlet
 from lidarspec.transports.serving import ServedSensor, VirtualClock
 
@@ -41,7 +43,9 @@ def virtual_port(
             (`Sensor.fillers`).
         rate: speed relative to real time; with `inf`, the sensor sends as fast as the reader reads.
         faults: the faults to simulate on the links of the sensor.
-        virtual_time: whether the sensor's time passes only in calls of `advance`.
+        virtual_time: whether the sensor's time passes only in calls of `advance`. If the sensor has
+            no clock and its scans end after a fixed time (`Every`), they still end by real time,
+            and a Python warning is issued.
 
     Yields:
         An object with the attributes `path` (to open) and `device` (`device.commands_received`
@@ -55,6 +59,12 @@ def virtual_port(
         resolved = sensor
     else:
         resolved = named_sensor(sensor)
+    if virtual_time and resolved.clock is None and isinstance(resolved.scan, Every):
+        warnings.warn(
+            f"{resolved.id} has no clock, so its scans end by arrival times, which are real times"
+            " also with virtual_time=True: read packets, or leave virtual_time out",
+            stacklevel=3,
+        )
     device = SimulatedDevice(resolved, scene=scene, seed=seed, rate=rate, faults=faults)
     with contextlib.ExitStack() as stack:
         if to == "pty" and link is None:

@@ -182,6 +182,16 @@ def test_advance_needs_virtual_time_and_a_program(monkeypatch: pytest.MonkeyPatc
 
 
 @posix
+def test_scans_without_a_clock_do_not_end_in_virtual_time() -> None:
+    with contextlib.ExitStack() as stack:
+        with pytest.warns(UserWarning, match="benewake-tfmini has no clock, so its scans end by"):
+            port = stack.enter_context(virtual_port("benewake-tfmini", virtual_time=True))
+        device = stack.enter_context(ls.open(port.path, "benewake-tfmini"))
+        port.advance(1.0)
+        assert len(next(device.packets())) > 0
+
+
+@posix
 def test_a_test_waits_for_the_commands_of_a_program() -> None:
     with virtual_port("cspc-m1c1-mini") as port:
         port.wait_for_commands([], timeout=0)
