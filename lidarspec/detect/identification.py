@@ -40,6 +40,7 @@ from lidarspec.errors import (
 )
 from lidarspec.expressions.columns import Batch, Fields
 from lidarspec.frames.layout import Bytes2D, FrameChecksum, Sums
+from lidarspec.frames.number_format import find_number_format
 from lidarspec.frames.parse import identify
 from lidarspec.frames.schema import make_schema
 from lidarspec.framing.decoder import Decoder
@@ -347,7 +348,12 @@ def _describe_fact(fact: Reported, value: Any, info: FieldInfo) -> str:
     if info.labels and isinstance(value, int):
         return format_code(value, UNKNOWN_CODE)
     if isinstance(value, int | float):
-        return f"{info.physical(value):g} {info.unit}".rstrip()
+        physical = info.physical(value)
+        if isinstance(physical, float):
+            text = find_number_format(info).format(physical)
+        else:
+            text = str(physical)  # all digits, for example of a serial number
+        return f"{text} {info.unit}".rstrip()
     return f"{value}"
 
 

@@ -31,6 +31,16 @@ def test_texts_bytes_and_numbers_with_units_are_formatted() -> None:
     assert told.endswith(" degC")
 
 
+def test_all_digits_of_numbers_are_formatted() -> None:
+    numbers = dataclasses.replace(
+        SHAPES["shape-numbers"], info={"serial": "data.serial", "angle": "data.azimuth"}
+    )
+    data = numbers.parse(numbers.example("data"))
+    data.serial, data.azimuth = 9007199254740993, 0.123456789
+    found = read_info(numbers, [Found("data", 0, numbers.build("data", data))])
+    assert found == {"serial": "9007199254740993", "angle": "0.123456789 rad"}
+
+
 def test_device_and_doctor_report_the_last_values(tmp_path: Path) -> None:
     helios = ls.sensor("robosense-helios16p")
     difop = helios.parse(helios.example("difop"))

@@ -232,7 +232,7 @@ def test_a_simulated_one_is_opened_started_and_read(name: str) -> None:
             "serial": "SIMULATED",
             "model": {MID360.id: "MID-360"}.get(name, "HAP"),
             "firmware": "13.18.2.40",
-            "temperature": "41.5 degC",
+            "temperature": "41.50 degC",
         }
         if name == MID40.id:
             told = {"serial": "0TFSIMULATED001", "model": "Mid-40", "firmware": "4.11.0.6"}
