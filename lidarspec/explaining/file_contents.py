@@ -129,9 +129,10 @@ class FileContents:
         size: the size of the file, in bytes.
         header: the header of a recording; None for other files.
         flows: the packets by sender and receiver, most bytes first; a byte stream has one flow.
-        first_ns: arrival time of the first packet, ns since 1970; None if unknown.
-        last_ns: arrival time of the last packet, ns since 1970; None if unknown.
-        last_read_ns: arrival time of the last packet that was read; None if unknown.
+        first_ns: earliest arrival time, ns since 1970; None if unknown. In a corrupt capture, this
+            may not be the time of the first packet.
+        last_ns: latest arrival time, ns since 1970; None if unknown.
+        last_read_ns: latest arrival time of the packets that were read; None if unknown.
         whole: whether the whole file was read; if not, all counts refer to its beginning.
     """
 
@@ -278,9 +279,10 @@ def _count_packets(contents: FileContents, opened: Transport) -> None:
         flow.packets += 1
         flow.bytes += len(chunk.data)
         bytes_left -= len(chunk.data)
-        if contents.first_ns is None:
-            contents.first_ns = chunk.at or None
-        contents.last_read_ns = contents.last_ns = chunk.at or contents.last_ns
+        if chunk.at:
+            contents.first_ns = min(chunk.at, contents.first_ns or chunk.at)
+            contents.last_ns = max(chunk.at, contents.last_ns or chunk.at)
+            contents.last_read_ns = contents.last_ns
         if bytes_left <= 0 or index >= MAX_BEGINNING_PACKETS:
             contents.last_ns = _find_last_time(opened, chunks)
             contents.whole = False
