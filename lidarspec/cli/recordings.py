@@ -303,17 +303,24 @@ def replay(
 
 
 def _run_replay(played: Replay, destination: Outlet | BackgroundWriter, file: str) -> bool:
-    """Run a replay, and return whether the user interrupted it."""
-    with contextlib.closing(destination), Progress() as progress:
-        try:
-            progress.run_task(played.run(), lambda: _describe_progress(played))
-        except KeyboardInterrupt:
-            return True
-        except WireError as error:
-            raise suggest(error, f"lidarspec show {shlex.quote(file)}") from None
-        finally:
-            if isinstance(destination, Outlet):
-                destination.finish()
+    """Run a replay, and return whether the user interrupted it.
+
+    If the replay fails before the first record, the new file is removed.
+    """
+    try:
+        with contextlib.closing(destination), Progress() as progress:
+            try:
+                progress.run_task(played.run(), lambda: _describe_progress(played))
+            except KeyboardInterrupt:
+                return True
+            except WireError as error:
+                raise suggest(error, f"lidarspec show {shlex.quote(file)}") from None
+            finally:
+                if isinstance(destination, Outlet):
+                    destination.finish()
+    finally:
+        if isinstance(destination, BackgroundWriter) and not destination.records:
+            destination.discard()
     return False
 
 

@@ -401,6 +401,16 @@ def test_impossible_replays_give_a_reason(stream: Path, datagrams: Path, tmp_pat
     )
 
 
+@pytest.mark.parametrize("suffix", [".lsr", ".pcap"])
+def test_a_failed_replay_leaves_no_file(datagrams: Path, tmp_path: Path, suffix: str) -> None:
+    target = tmp_path / f"it{suffix}"
+    ran("replay", datagrams, "--to", target, "--slice", "100s:101s", code=2)
+    assert not target.exists()
+    target.write_bytes(b"precious")
+    ran("replay", datagrams, "--to", target, "--slice", "100s:101s", "--force", code=2)
+    assert target.read_bytes() == b"precious"
+
+
 def test_a_replay_sums_up_with_a_digest(datagrams: Path) -> None:
     found = json.loads(
         ran("replay", datagrams, "--to", "udp://127.0.0.1:45672", "--speed", "10x", "--json").stdout
