@@ -314,7 +314,8 @@ def _run_replay(played: Replay, destination: Outlet | BackgroundWriter, file: st
             except KeyboardInterrupt:
                 return True
             except WireError as error:
-                raise suggest(error, f"lidarspec show {shlex.quote(file)}") from None
+                path = "FILE" if file == "-" else shlex.quote(file)
+                raise suggest(error, f"lidarspec info {path}") from None
             finally:
                 if isinstance(destination, Outlet):
                     destination.finish()

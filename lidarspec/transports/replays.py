@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator
 
@@ -19,7 +20,14 @@ from lidarspec.recording.background_writer import BackgroundWriter
 from lidarspec.scans.selection import Times, iter_received
 from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.outlets import READER_LEFT, Outlet
-from lidarspec.transports.protocol import Chunk, Disconnected, Sender, Transport, name_senders
+from lidarspec.transports.protocol import (
+    Chunk,
+    Disconnected,
+    Sender,
+    Transport,
+    name_senders,
+    no_bytes_message,
+)
 
 _SECOND_NS = 1_000_000_000
 #: A chunk is counted as late if it is sent more than this time after its deadline.
@@ -146,37 +154,46 @@ class Replay:
 
         Raises:
             UsageError: if the file has no times, but they are required.
-            WireError: if the file contains no data.
+            WireError: if the file contains no data. This is raised before waiting for a reader.
             SourceError: if the file cannot be read, or nothing can be sent.
         """
-        while True:
-            if isinstance(self._destination, Outlet):
-                has_reader_left = self._destination.await_listener()
-                if has_reader_left:
-                    yield f"{self._destination.local_source}: {READER_LEFT}"
-            if not self.chunks:
-                self._start = time.monotonic()
+        yield from self._run_once()
+        while self._loop:
             yield from self._run_once()
-            if not self.chunks:
-                raise WireError(f"{self._source} contains no data")
-            if not self._loop:
-                return
 
     def _run_once(self) -> Iterator[str]:
         opened = self._transport or open_transport(self._source)
         self._transport = None
         with contextlib.closing(opened) as source:
             chunks = self._check_times(iter_received(source, self._times, self._source))
+            # Reading before waiting for a listener, so that errors of the file are raised at once.
+            first = next(chunks, None)
+            if first is None:
+                raise WireError(no_bytes_message(self._source, source.warnings))
+            yield from self._await_listener()
             try:
-                for chunk, late_ns in iter_at_deadlines(chunks, speed=self._speed):
-                    self._send(chunk)
-                    self._count(chunk, late_ns)
-                    yield ""
+                yield from self._send_all(itertools.chain([first], chunks))
             except Disconnected as error:
                 yield str(error)
                 return
             if not self._loop:
                 yield from source.warnings
+
+    def _await_listener(self) -> Iterator[str]:
+        """Wait until a reader opens the outlet; yield a message if a reader has disconnected."""
+        if isinstance(self._destination, Outlet):
+            has_reader_left = self._destination.await_listener()
+            if has_reader_left:
+                yield f"{self._destination.local_source}: {READER_LEFT}"
+        if not self.chunks:
+            self._start = time.monotonic()
+
+    def _send_all(self, chunks: Iterable[Chunk]) -> Iterator[str]:
+        """Send chunks at their deadlines, and yield "" after each."""
+        for chunk, late_ns in iter_at_deadlines(chunks, speed=self._speed):
+            self._send(chunk)
+            self._count(chunk, late_ns)
+            yield ""
 
     def _send(self, chunk: Chunk) -> None:
         if isinstance(self._destination, Outlet):

@@ -401,6 +401,16 @@ def test_impossible_replays_give_a_reason(stream: Path, datagrams: Path, tmp_pat
     )
 
 
+def test_a_replay_of_nothing_does_not_wait_for_a_reader(stream: Path, tmp_path: Path) -> None:
+    empty = tmp_path / "empty.bin"
+    empty.touch()
+    for target in ("tcp://127.0.0.1:0", tmp_path / "it.lsr"):
+        said = ran("replay", empty, "--to", target, code=4).stderr
+        assert f"{empty} contains no bytes\n  next: lidarspec info {empty}\n" in said
+    slicing = ("--slice", "100s:101s")
+    assert "outside" in ran("replay", stream, "--to", "tcp://127.0.0.1:0", *slicing, code=2).stderr
+
+
 @pytest.mark.parametrize("suffix", [".lsr", ".pcap"])
 def test_a_failed_replay_leaves_no_file(datagrams: Path, tmp_path: Path, suffix: str) -> None:
     target = tmp_path / f"it{suffix}"
