@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shlex
 
 import click
@@ -356,12 +357,14 @@ def _announce(file: str, target: str, sensor: Sensor | None, *, as_json: bool) -
         note(f"replaying {file} to {target} when a reader opens it")
         note(f"next: lidarspec {_make_view_words(sensor, target)}")
         return
-    source = target
-    has_port = ":" in target.removeprefix("udp://")
-    if not has_port:
-        source = "udp://" if sensor else "udp://:PORT"
     note(f"replaying {file} to {target}")
-    note(f"next: lidarspec {_make_view_words(sensor, source)}")
+    has_port = re.search(r":\d+$", target) is not None
+    if has_port:
+        note(f"next: lidarspec {_make_view_words(sensor, target)}")
+    elif sensor is not None:
+        note(f"next: lidarspec {_make_view_words(sensor, 'udp://')}")
+    else:
+        note("next: lidarspec detect")  # listens to the ports of all sensors
 
 
 def _make_view_words(sensor: Sensor | None, target: str) -> str:

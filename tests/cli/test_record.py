@@ -401,6 +401,17 @@ def test_impossible_replays_give_a_reason(stream: Path, datagrams: Path, tmp_pat
     )
 
 
+def test_a_replay_to_the_recorded_ports_suggests_a_valid_source(
+    datagrams: Path, tmp_path: Path
+) -> None:
+    capture = tmp_path / "it.pcap"
+    ran("replay", datagrams, "--to", capture)
+    udp = ("--to", "udp://127.0.0.1", "--speed", "max")
+    assert ran("replay", capture, *udp).stderr.count("next: lidarspec detect\n") == 1
+    said = ran("replay", capture, *udp, "-s", DATAGRAMS).stderr
+    assert f"next: lidarspec view udp:// -s {DATAGRAMS}\n" in said
+
+
 def test_a_replay_of_nothing_does_not_wait_for_a_reader(stream: Path, tmp_path: Path) -> None:
     empty = tmp_path / "empty.bin"
     empty.touch()
