@@ -393,10 +393,17 @@ def _open_by_content(
         return StreamCaptureTransport(name, file)
     if is_capture(start):
         return CaptureTransport(name, file, sender=sender)
-    suffixes = set(Path(path.lower()).suffixes[-2:])  # compression adds a second suffix
-    is_text = suffixes & HEX_SUFFIXES or (
-        suffixes & TEXT_SUFFIXES and is_hexadecimal(start, whole=len(start) < HEAD_BYTES)
-    )
-    if is_text:
+    if _is_hex_text(path, start):
         return HexTransport(name, file)
     return FileTransport(name, file)
+
+
+def _is_hex_text(path: str, start: bytes) -> bool:
+    """Return whether a file is hexadecimal text, by its name and its first bytes."""
+    if path == "-":
+        # A pipe may contain only a part of the first line yet.
+        return is_hexadecimal(start, whole=False)
+    suffixes = set(Path(path.lower()).suffixes[-2:])  # compression adds a second suffix
+    if suffixes & HEX_SUFFIXES:
+        return True
+    return bool(suffixes & TEXT_SUFFIXES) and is_hexadecimal(start, whole=len(start) < HEAD_BYTES)
