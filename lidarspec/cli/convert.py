@@ -18,6 +18,7 @@ import numpy as np
 from lidarspec import batch
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.inputs import (
+    exit_if_damaged,
     identify_file,
     iter_device_scans,
     make_no_frame_error,
@@ -495,6 +496,7 @@ def _write_packets(
         note(warning)
     if as_json:
         emit_json({"output": target, "packets": file.records, "bytes": file.bytes}, None)
+    exit_if_damaged(opened.unread)
 
 
 def _write_points(

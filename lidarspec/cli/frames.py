@@ -47,7 +47,7 @@ def parse(
 
     --slice selects by arrival time. Offsets are then relative to the beginning of the slice.
     """
-    with open_input(words, selection.times) as (sample, chunks):
+    with open_input(words, selection.times, reports_damage=True) as (sample, chunks):
         sensor, fits = _find_sensor(sample, sensor_id)
         wanted = FrameSelection(sensor, count=count)
         selected = wanted.iter_valid(iter_pieces(sensor, chunks, datagrams=sample.datagrams))
@@ -163,7 +163,7 @@ def explain(
         raise UsageError(
             "--at and --bytes cannot be combined: use --at for one byte, or --bytes for a range"
         )
-    with open_input(words, selection.times) as (sample, chunks):
+    with open_input(words, selection.times, reports_damage=True) as (sample, chunks):
         sensor, fits = _find_sensor(sample, sensor_id, allow_similar=True)
         if not sample.data:
             raise make_no_frame_error(sensor, sample)

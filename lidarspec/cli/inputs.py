@@ -64,7 +64,7 @@ POLL_S = 0.1
 
 @contextlib.contextmanager
 def open_input(
-    words: Sequence[str], times: Times = (None, None)
+    words: Sequence[str], times: Times = (None, None), *, reports_damage: bool = False
 ) -> Iterator[tuple[SampleBytes, Iterator[Chunk]]]:
     """Open the input that command-line arguments name.
 
@@ -75,14 +75,17 @@ def open_input(
     Args:
         words: the arguments: hexadecimal text, "-", a file name, or a device of lidarspec.toml.
         times: the range of arrival times to read, if the input is a file.
+        reports_damage: whether to exit with code 1 at the end, if a corrupt part of a file could
+            not be read.
 
     Raises:
         UsageError: for text that is neither hexadecimal nor a file.
         SourceError: for a file that cannot be read.
+        click.exceptions.Exit: see `reports_damage`.
     """
     text = " ".join(words)
     if text == "-" or (len(words) == 1 and _is_file(text)):
-        reading = _open_file(text, times)
+        reading = _open_file(text, times, reports_damage=reports_damage)
     else:
         try:
             if not (data := parse_hex(text)):
@@ -97,7 +100,7 @@ def open_input(
 
             if (device := find_device(text)) is None:
                 raise _make_no_bytes_error(words, error) from None
-            reading = open_input([device.source], times)
+            reading = open_input([device.source], times, reports_damage=reports_damage)
     with reading as sample:
         yield sample
 
@@ -111,7 +114,9 @@ def _is_file(text: str) -> bool:
 
 
 @contextlib.contextmanager
-def _open_file(path: str, times: Times) -> Iterator[tuple[SampleBytes, Iterator[Chunk]]]:
+def _open_file(
+    path: str, times: Times, *, reports_damage: bool
+) -> Iterator[tuple[SampleBytes, Iterator[Chunk]]]:
     from lidarspec.transports.files import FileTransport
     from lidarspec.transports.open_url import open_transport
 
@@ -123,9 +128,13 @@ def _open_file(path: str, times: Times) -> Iterator[tuple[SampleBytes, Iterator[
         with _read_beginning(
             path, chunks, datagrams=file.datagrams, warnings=file.warnings
         ) as opened:
-            yield opened
-        for warning in file.warnings if opened[0].chunks else ():
-            note(warning)
+            try:
+                yield opened
+            finally:  # also if the verb exits because of damaged frames
+                for warning in file.warnings if opened[0].chunks else ():
+                    note(warning)
+        if reports_damage:
+            exit_if_damaged(file.unread)
 
 
 @contextlib.contextmanager
@@ -380,7 +389,16 @@ def report_outcome(device: Device) -> None:
             note(warning)
     if failure is not None:
         raise failure
-    if device.stats.unread:
+    exit_if_damaged(device.stats.unread)
+
+
+def exit_if_damaged(unread: int) -> None:
+    """Exit with code 1 if a corrupt part of a source could not be read.
+
+    Args:
+        unread: number of bytes that could not be read, from `Transport.unread`.
+    """
+    if unread:
         raise click.exceptions.Exit(FINDINGS)
 
 

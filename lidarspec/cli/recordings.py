@@ -10,7 +10,7 @@ import shlex
 import click
 
 from lidarspec.cli.failures import INTERRUPTED
-from lidarspec.cli.inputs import make_no_scan_error, refuse_overwriting
+from lidarspec.cli.inputs import exit_if_damaged, make_no_scan_error, refuse_overwriting
 from lidarspec.cli.options import DURATION, SPEED, count_option, selection_options, sensor_option
 from lidarspec.cli.output import Progress, emit_json, format_size
 from lidarspec.cli.terminal import note, say
@@ -128,6 +128,7 @@ def record(
         note(str(error))
     if interrupted:
         raise click.exceptions.Exit(INTERRUPTED)
+    exit_if_damaged(task.unread)
 
 
 def _make_slice_error(source: str, target: str, times: str) -> UsageError:
@@ -301,6 +302,7 @@ def replay(
     _print_summary(file, target, sensor, played, is_file=is_file, as_json=as_json)
     if is_interrupted:
         raise click.exceptions.Exit(INTERRUPTED)
+    exit_if_damaged(played.unread)
 
 
 def _run_replay(played: Replay, destination: Outlet | BackgroundWriter, file: str) -> bool:

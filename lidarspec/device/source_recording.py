@@ -161,6 +161,7 @@ class SourceRecording:
         packets: number of data packets so far, or of datagrams if the sensor is unknown.
         elapsed: seconds since the source was opened. At the end, the duration of the recording in
             seconds, if it has arrival times.
+        unread: number of bytes that could not be read from a damaged file.
     """
 
     def __init__(
@@ -188,6 +189,7 @@ class SourceRecording:
         self._limited_recorder: LimitedRecorder | None = None
         self.packets = 0
         self.elapsed = 0.0
+        self.unread = 0
         self._began = 0.0
         self._reported = set[str]()  # the present warnings, without numbers
 
@@ -276,6 +278,7 @@ class SourceRecording:
                 yield from self._record_live(source, recorder)
             else:
                 yield from self._copy(source, recorder)
+            self.unread = source.unread
             yield from source.warnings
 
     def _record_live(

@@ -134,6 +134,7 @@ class FileContents:
         last_ns: latest arrival time, ns since 1970; None if unknown.
         last_read_ns: latest arrival time of the packets that were read; None if unknown.
         whole: whether the whole file was read; if not, all counts refer to its beginning.
+        unread: number of bytes that could not be read, because the file is corrupt.
     """
 
     path: str
@@ -145,6 +146,7 @@ class FileContents:
     last_ns: int | None = None
     last_read_ns: int | None = None
     whole: bool = True
+    unread: int = 0
     contents: list[SensorContent] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
@@ -182,6 +184,7 @@ class FileContents:
                     "kind",
                     "size",
                     "whole",
+                    "unread",
                     "packets",
                     "bytes",
                     "first_ns",
@@ -242,6 +245,7 @@ def read_contents(path: str | Path) -> FileContents:
         contents = FileContents(str(path), kind, _measure_size(Path(file)), header)
         _count_packets(contents, opened)
         contents.warnings += opened.warnings
+        contents.unread = opened.unread
     if contents.bytes:
         contents.contents += _find_sensors(contents)
     return contents

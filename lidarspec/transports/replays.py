@@ -106,6 +106,7 @@ class Replay:
         greatest_delay_ns: the greatest delay of a chunk.
         is_timed: whether the chunks of the file have times.
         digest: SHA-256 of all bytes.
+        unread: number of bytes that could not be read from a damaged file.
     """
 
     def __init__(
@@ -134,6 +135,7 @@ class Replay:
         self.greatest_delay_ns = 0
         self.is_timed = True
         self.digest = hashlib.sha256()
+        self.unread = 0
 
     @property
     def seconds(self) -> float:
@@ -176,6 +178,7 @@ class Replay:
             except Disconnected as error:
                 yield str(error)
                 return
+            self.unread = source.unread
             if not self._loop:
                 yield from source.warnings
 

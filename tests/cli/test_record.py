@@ -267,15 +267,41 @@ def test_damaged_recordings_are_salvaged(stream: Path, tmp_path: Path) -> None:
     whole = bytearray(stream.read_bytes())
     whole[len(whole) // 2] ^= 1
     stream.write_bytes(whole)
-    said = ran("record", stream, "-o", tmp_path / "stopped.lsr").stderr
+    said = ran("record", stream, "-o", tmp_path / "stopped.lsr", code=1).stderr
     assert "corrupt at byte" in said
     assert f"next: lidarspec record {stream} --salvage" in said
     assert (
         "corrupt in 1 place"
-        in ran("record", stream, "--salvage", "-o", tmp_path / "mended.lsr").stderr
+        in ran("record", stream, "--salvage", "-o", tmp_path / "mended.lsr", code=1).stderr
     )
     with ls.open(tmp_path / "mended.lsr") as device:
         assert sum(len(packets) for packets in device.packets()) == 39
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("info", "FILE"),
+        ("parse", "FILE", "-s", STREAM),
+        ("explain", "FILE", "-s", STREAM, "--bad"),
+        ("record", "FILE", "-o", "NEW"),
+        ("replay", "FILE", "--to", "NEW"),
+        ("convert", "FILE", "NEW"),
+        ("stats", "FILE"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_every_verb_reports_a_damaged_recording(
+    stream: Path, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    paths = {"FILE": stream, "NEW": tmp_path / "new.lsr"}
+    whole = bytearray(stream.read_bytes())
+    whole[len(whole) // 2] ^= 1
+    stream.write_bytes(whole)
+    said = ran(*(paths.get(word, word) for word in words), code=1).stderr
+    assert said.count("corrupt at byte") == 1
+    stream.write_bytes(whole[: len(whole) // 2])  # truncated: nothing after it is lost
+    ran(*(paths.get(word, word) for word in words), *["--force"] * ("NEW" in words))
 
 
 def test_an_old_recording_survives_a_silent_source(tmp_path: Path) -> None:
