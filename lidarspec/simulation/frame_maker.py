@@ -55,7 +55,9 @@ class FrameMaker:
         }
         self.engine = engine
         self._coder: Coder | None = frame_coder(engine.frame)
-        self._set_up(sensor.id, engine.frame.tree, engine.frame.max_struct_bytes, {}, elsewhere)
+        self._set_up(
+            sensor.id, frame, engine.frame.tree, engine.frame.max_struct_bytes, {}, elsewhere
+        )
 
     @classmethod
     def of_struct(cls, sensor: str, frame: Frame) -> FrameMaker:
@@ -64,26 +66,37 @@ class FrameMaker:
         Args:
             sensor: the id of the sensor, for errors.
         """
-        return cls._of_parts(sensor, frame.tree, frame.max_struct_bytes, {})
+        return cls._of_parts(sensor, "", frame.tree, frame.max_struct_bytes, {})
 
     @classmethod
-    def _of_parts(cls, sensor: str, root: Node, limit: int, given: Mapping[str, int]) -> FrameMaker:
+    def _of_parts(
+        cls, sensor: str, place: str, root: Node, limit: int, given: Mapping[str, int]
+    ) -> FrameMaker:
         """Return a maker for parts of one kind.
 
         Args:
             sensor: id of the sensor, for messages.
+            place: path of the parts, for messages.
             limit: maximum length of a frame, in bytes.
             given: raw values, by path, of those fields of the frame that the parts depend on.
         """
         maker = cls.__new__(cls)
         maker._coder = None  # only whole frames have a wire form
-        maker._set_up(sensor, root, limit, given, set())
+        maker._set_up(sensor, place, root, limit, given, set())
         return maker
 
     def _set_up(
-        self, sensor: str, root: Node, limit: int, given: Mapping[str, int], elsewhere: set[str]
+        self,
+        sensor: str,
+        place: str,
+        root: Node,
+        limit: int,
+        given: Mapping[str, int],
+        elsewhere: set[str],
     ) -> None:
         self._sensor = sensor
+        #: The name of the frame type, and for parts their path in it; "" for a struct.
+        self._place = place
         self._root = root
         self._limit = limit
         self._given = given
@@ -183,11 +196,10 @@ class FrameMaker:
             try:
                 result[path] = info.adapter.encode(value, info.bits // 8)
             except Exception as error:  # a function of the plugin may raise anything
-                raise SpecError(
+                raise self._make_error(
+                    path,
                     f"sweep returns {value!r}, which cannot be encoded:"
                     f" {type(error).__name__}: {error}",
-                    path=path,
-                    sensor=self._sensor,
                 ) from error
         for path, ending in self.schema.endings.items():
             # A missing text is empty, and a missing number is 0, which has one byte.
@@ -204,12 +216,16 @@ class FrameMaker:
             try:
                 shape = np.asarray(find_code(info, value), np.float64).shape
             except (TypeError, ValueError):
-                raise self._make_value_error(path, f"{value!r:.60}, expected numbers") from None
+                raise self._make_error(
+                    path, f"sweep returns {value!r:.60}, expected numbers"
+                ) from None
             if value is None:
-                raise self._make_value_error(path, "None, expected numbers")
+                raise self._make_error(path, "sweep returns None, expected numbers")
             if len(shape) > len(info.axes):
                 expected = f"at most {len(info.axes)} axes" if info.axes else "a single number"
-                raise self._make_value_error(path, f"values of shape {shape}, expected {expected}")
+                raise self._make_error(
+                    path, f"sweep returns values of shape {shape}, expected {expected}"
+                )
 
     def _check_lengths(self, leaf: Leaf, value: Any) -> None:
         """Raise an error if a value is an array whose lengths differ from those of its field."""
@@ -217,12 +233,13 @@ class FrameMaker:
             leaf.info.axes, leaf.shape, np.shape(value), strict=False
         ):
             if length not in (1, expected):
-                raise self._make_value_error(
-                    leaf.info.path, f"{length} values, but {axis} has {expected} elements"
+                raise self._make_error(
+                    leaf.info.path,
+                    f"sweep returns {length} values, but {axis} has {expected} elements",
                 )
 
-    def _make_value_error(self, path: str, what: str) -> SpecError:
-        return SpecError(f"sweep returns {what}", path=path, sensor=self._sensor)
+    def _make_error(self, path: str, reason: str) -> SpecError:
+        return SpecError(reason, path=f"{self._place}.{path}".strip("."), sensor=self._sensor)
 
     def _with_counts(self, values: Values) -> Values:
         """Return the values of a frame, completed by the counts of its arrays."""
@@ -244,7 +261,7 @@ class FrameMaker:
             parts = [dict(part) for part in result.pop(axis, ())]
             kinds = [find_kind(node, part) for part in parts]
             around = {ref.path: self._get_raw(result, ref.path) for ref in node.outer}
-            makers = [self._get_maker(kind, around) for kind in kinds]
+            makers = [self._get_maker(axis, kind, around) for kind in kinds]
             sizes = [
                 maker._find_layout(maker._with_parts(maker._encode_texts(part))[0]).size
                 for maker, part in zip(makers, parts, strict=True)
@@ -265,10 +282,13 @@ class FrameMaker:
             result[node.total.path] = len(parts_by_axis[axis])
         return result, parts_by_axis
 
-    def _get_maker(self, kind: Kind, around: Mapping[str, int]) -> FrameMaker:
+    def _get_maker(self, axis: str, kind: Kind, around: Mapping[str, int]) -> FrameMaker:
         key = (kind, *around.items())
         if key not in self._makers:
-            self._makers[key] = FrameMaker._of_parts(self._sensor, kind.root, self._limit, around)
+            place = f"{self._place}.{axis}".strip(".")
+            self._makers[key] = FrameMaker._of_parts(
+                self._sensor, place, kind.root, self._limit, around
+            )
         return self._makers[key]
 
     def _fill_in(
@@ -316,7 +336,7 @@ class FrameMaker:
             reason = (
                 f"sweep must return {left_out[0]!r}, because the length of the frame depends on it"
             )
-        return SpecError(reason, path=path, sensor=self._sensor)
+        return self._make_error(path, reason)
 
     def _make_rows(
         self, layout: Layout, frames: Sequence[tuple[Values, Mapping[str, bytes]]]
@@ -331,10 +351,8 @@ class FrameMaker:
             if leaf is None and path in self._elsewhere:
                 continue
             if leaf is None:
-                raise SpecError(
-                    "sweep returns a value for a field that the frame does not have",
-                    path=path,
-                    sensor=self._sensor,
+                raise self._make_error(
+                    path, "sweep returns a value for a field that the frame does not have"
                 )
             given = [find_code(leaf.info, values.get(path, 0)) for values, _ in frames]
             for value in given:

@@ -964,7 +964,10 @@ class FramesWithoutPoints:
         declared = self._sensor.frames[name]
         state = self._sensor.state.get(name, {})
         sweep = declared.simulation.sweep
-        given = [{**state, **(sweep(number) if sweep else {}), **values} for number in numbers]
+        given = [{**state, **values} for _ in numbers]
+        if sweep is not None:
+            with plugin_errors(f"sweep of {name}", self._sensor.id, sweep):
+                given = [{**state, **sweep(number), **values} for number in numbers]
         table = self._get_maker(name).table(given)
         if declared.imu is not None:
             rest = self._rests.setdefault(name, RestingImu(self._sensor, name, given[0]))

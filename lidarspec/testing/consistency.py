@@ -17,6 +17,7 @@ from lidarspec.framing.frame_engine import get_codec
 from lidarspec.packets.clocks import clock_ns
 from lidarspec.packets.masked_sector import FULL_TURNS
 from lidarspec.simulation.frame_maker import FrameMaker
+from lidarspec.simulation.simulator import FramesWithoutPoints, find_periodic_rates
 from lidarspec.spec import Clock
 from lidarspec.spec.tree import FieldInfo, to_exact
 from lidarspec.testing.findings import ViolationError, require
@@ -84,6 +85,17 @@ def sweep_values_fit_their_fields(subject: SensorUnderTest, name: str) -> None:
                     f" {low:g} to {high:g} {info.unit}",
                     f"{name}.{path}",
                 )
+
+
+def periodic_frames_can_be_simulated(subject: SensorUnderTest, name: str) -> None:
+    """Check that a frame without points can be simulated if it is sent periodically."""
+    sensor = subject.sensor
+    if name not in find_periodic_rates(sensor) or not get_codec(sensor.frames[name]).is_compiled:
+        return
+    try:
+        FramesWithoutPoints(sensor).make_frame(name, 0)
+    except LidarSpecError as error:
+        raise ViolationError("LS508", str(error), f"{name}.sweep") from error
 
 
 def _is_limited(info: FieldInfo) -> bool:

@@ -273,6 +273,7 @@ PROPERTIES = (
         lacks=_no_sweep,
         unless=("LS201", "LS218", *FAILING_RULES, "LS502", "LS415", "LS503"),
     ),
+    Property(consistency.periodic_frames_can_be_simulated, "frame", "LS508", unless=FAILING_RULES),
     Property(commands.a_command_parses_back, "command", "LS601", lacks=_no_commands),
     Property(commands.arguments_outside_ranges_are_errors, "command", "LS602", lacks=_no_commands),
     Property(commands.replies_can_match, "command", "LS603", lacks=_no_commands),

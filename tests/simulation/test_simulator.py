@@ -17,9 +17,10 @@ from lidarspec import Sensor, SourceError, SpecError, UsageError, simulate
 from lidarspec.errors import PluginError
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.scenes import Box, Mover, Room, make_room, parse_scene, read_scene
-from lidarspec.simulation.simulator import frame_simulation
+from lidarspec.simulation.simulator import FramesWithoutPoints, frame_simulation
 from lidarspec.spec import Cartesian, Frame, Polar, Scaled, Serial, Simulation, Udp, stack
 from lidarspec.testing.geometry import distance_outside
+from tests.broken import periodic_sweep_of_nothing
 from tests.engine import against_construct
 from tests.representatives import REPRESENTATIVES
 from tests.shapes import coordinates, count, sized
@@ -543,5 +544,19 @@ def test_values_of_a_sweep_that_do_not_fit_their_field_are_spec_errors(
         points=lambda f: Polar(range=f.samples.distance, azimuth=f.samples.index),
         simulation=Simulation(lambda i: values, rate=10),
     )
-    with pytest.raises(SpecError, match=re.escape(f": {reason}")):
+    with pytest.raises(SpecError, match=re.escape(f": data.{reason}")):
         simulate(made, 2)
+
+
+def test_an_error_of_a_periodic_frame_names_the_frame() -> None:
+    device = SimulatedDevice(periodic_sweep_of_nothing.lidarspec_sensors()[0])
+    with pytest.raises(SpecError, match=r"^broken-one: status\.status: sweep returns a value for"):
+        device.start(0)
+
+
+def test_an_exception_of_a_periodic_sweep_is_a_plugin_error() -> None:
+    (sensor,) = periodic_sweep_of_nothing.lidarspec_sensors()
+    status = replace(sensor.frames["status"], simulation=Simulation(lambda i: 1 / 0, rate=10))
+    failing = replace(sensor, frames={**sensor.frames, "status": status})
+    with pytest.raises(PluginError, match="sweep of status: ZeroDivisionError"):
+        FramesWithoutPoints(failing).make_frame("status", 0)
