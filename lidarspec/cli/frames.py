@@ -332,7 +332,8 @@ class FrameSelection:
             raise UsageError(
                 f"{sample.source} has only {self._end} bytes; byte {self._from} does not exist"
             )
-        if not self.valid and (self._ended or not self._bad):
+        has_frame = self.valid or (self._bad and self.damaged)
+        if not has_frame and (self._ended or not self._bad):
             if self._fault is None and self._frame is not None:
                 if self.others:
                     others = f"; it contains {self.others} frames of other types"

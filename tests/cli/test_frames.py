@@ -165,6 +165,8 @@ def test_explain_can_show_damaged_frames_only(tmp_path: Path) -> None:
         "9 frames, 0 damaged, 0 bytes outside frames"
         in ran("explain", filled.hex(), "--bad", "-s", "cspc-m1c1-mini").stderr
     )
+    alone = ran("explain", frames[20].hex(), "--bad", *SENSOR, code=1)
+    assert alone.stderr == "0 frames, 1 damaged, 0 bytes outside frames\n"
     clean = ran("explain", frames[0].hex(), "--bad", *SENSOR)
     assert (clean.stdout, clean.stderr) == ("", "1 frame, 0 damaged, 0 bytes outside frames\n")
 
