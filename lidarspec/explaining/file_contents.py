@@ -37,7 +37,13 @@ from lidarspec.transports.files import (
     StreamCaptureTransport,
 )
 from lidarspec.transports.open_url import is_live, open_transport
-from lidarspec.transports.protocol import Chunk, Sender, Transport, format_sender
+from lidarspec.transports.protocol import (
+    Chunk,
+    Sender,
+    Transport,
+    format_sender,
+    no_bytes_message,
+)
 from lidarspec.transports.robotics_logs import BagTransport
 from lidarspec.view.live_frames import open_live
 from lidarspec.view.rate_meter import MeterReading
@@ -248,6 +254,8 @@ def read_contents(path: str | Path) -> FileContents:
         contents.unread = opened.unread
     if contents.bytes:
         contents.contents += _find_sensors(contents)
+    elif not contents.warnings:
+        contents.warnings.append(no_bytes_message(path, ()))
     return contents
 
 
