@@ -144,17 +144,21 @@ def draw_intensities(scans: Iterable[Scan], title: str) -> Any:
     """Return a figure with the histogram of the intensities.
 
     Raises:
-        UsageError: if the sensor measures no intensity.
+        UsageError: if the sensor measures no intensity, or if no point is valid.
     """
     counted = Counter[float]()
+    has_intensity = False
     for scan in scans:
         if scan.points.intensity is not None:
+            has_intensity = True
             values, value_counts = np.unique(
                 np.rint(scan.points.intensity[scan.points.valid]), return_counts=True
             )
             counted.update(dict(zip(values.tolist(), value_counts.tolist(), strict=True)))
-    if not counted:
+    if not has_intensity:
         raise UsageError("the sensor measures no intensity")
+    if not counted:
+        raise UsageError("no point of the selected scans has a return in the selected range")
     strengths, counts = np.array(sorted(counted.items())).T
     middle = strengths[np.searchsorted(np.cumsum(counts), counts.sum() / 2)]
     figure = _make_figure(f"{title}: {int(counts.sum()):,} returns")

@@ -206,6 +206,11 @@ def test_plot_writes_a_picture(capture: Path, tmp_path: Path) -> None:
     assert 500 < len(dots) <= 2160
     assert "10.0 Hz, " in "".join(text.text or "" for text in root.findall(".//{*}text"))
     assert ran("plot", capture, *SENSOR, "-o", "-").stdout.startswith("<svg")
+    far = ("--kind", "intensity", "--range", "1000m:2000m")
+    assert (
+        "has a return in the selected range"
+        in ran("plot", capture, *SENSOR, "-o", tmp_path / "far.svg", *far, code=2).stderr
+    )
     assert (
         "expected a file name that ends in"
         in ran("plot", capture, *SENSOR, "-o", tmp_path / "scan.gif", code=2).stderr
