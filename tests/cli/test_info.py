@@ -115,19 +115,19 @@ def test_a_file_without_times_and_one_without_sensor(tmp_path: Path) -> None:
     ran("info", empty, code=4)
 
 
+@pytest.mark.parametrize("name", ["empty.bin", "empty.lsr", "empty.pcap", "empty.hex"])
+def test_of_an_empty_file_the_reason_is_printed(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.touch()
+    assert ran("info", path, code=4).stderr == f"{path} contains no bytes\n"
+
+
 def test_a_capture_without_times_has_no_date(tmp_path: Path) -> None:
     path = tmp_path / "simple.pcapng"
     frames = simulate(ls.sensor("velodyne-vlp16"), 9)
     packets = [packet(frame(data), kind=SIMPLE) for data in frames]
     path.write_bytes(b"".join([section(), interface(), *packets]))
     assert run_json("info", path)["first_ns"] is None
-
-
-@pytest.mark.parametrize("name", ["empty.bin", "empty.lsr", "empty.pcap", "empty.hex"])
-def test_of_an_empty_file_the_reason_is_printed(tmp_path: Path, name: str) -> None:
-    path = tmp_path / name
-    path.touch()
-    assert ran("info", path, code=4).stderr == f"{path} contains no bytes\n"
     text = ran("info", path).stdout
     assert "9 packets" in text
     assert "no arrival times" in text
