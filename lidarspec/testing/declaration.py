@@ -26,7 +26,7 @@ from lidarspec.spec import Clock, Frame, OnWrap, Sensor
 from lidarspec.spec.fields import factor, is_unit
 from lidarspec.spec.syntax import is_expression
 from lidarspec.spec.timing import DAY_S
-from lidarspec.spec.tree import NAME_IS_COMPARED, ChecksummedStruct, Struct, infos, nodes
+from lidarspec.spec.tree import NAME_IS_COMPARED, ChecksummedStruct, FieldInfo, Struct, infos, nodes
 from lidarspec.testing.findings import Finding
 from lidarspec.testing.geometry import find_field_of_node, find_source_nodes, trace_points
 from lidarspec.testing.sensor_under_test import SensorUnderTest
@@ -119,12 +119,11 @@ def _check_sensor(sensor: Sensor) -> Findings:
 
 
 def _check_required_fields(sensor: Sensor) -> Findings:
-    """Yield findings for missing fields that scans, clock or counter need."""
-    field_paths = {
-        path
-        for name in sensor.main_frames
-        for path in get_codec(sensor.frames[name]).schema.scan_names
-    }
+    """Yield findings for fields that scans, clock or counter need: missing, or without unit."""
+    fields: dict[str, FieldInfo] = {}
+    for name in sensor.main_frames:
+        fields |= get_codec(sensor.frames[name]).schema.scan_names
+    field_paths = set(fields)
     if isinstance(sensor.scan, OnWrap):
         cut_by = field_paths | set(TYPES)
     else:
@@ -160,6 +159,8 @@ def _check_required_fields(sensor: Sensor) -> Findings:
         if path and without_indices(path)[0] not in allowed:
             what = f"`{purpose}` needs the field {path!r}, which is missing"
             yield "LS216", f"{what}{did_you_mean(path, allowed)}", purpose
+        elif purpose == "clock" and factor(fields[without_indices(path)[0]].unit, "s") is None:
+            yield "LS216", f"the clock reads {path!r}, which has no unit of time", purpose
 
 
 def _check_clock(sensor: Sensor) -> Findings:

@@ -75,7 +75,8 @@ LS214 columns have different shapes | a point needs one value of each
       | give one value for each point or packet; name the axis of an array with along(...)
 LS215 `spread` gives all samples one value | all points of a packet get the same angle or time
       | set full= to a full circle in the unit of the angle, or use steps(count)
-LS216 no data frame has this field | the scans, the clock or the counter need it | use a path that `lidarspec show` prints
+LS216 a field is missing, or the field of a clock has no unit of time | the scans, the clock or the counter need it
+      | use a path that `lidarspec show` prints; for a clock, Scaled(Int32ul, 1e-6, "s")
 LS217 the option changes nothing | users who set it get the same points | use it in `configure`, or remove it
 LS218 the intensity is calculated from another field | users expect the intensity that the sensor measured
       | use the intensity field

@@ -140,8 +140,8 @@ class Property:
         return findings
 
 
-#: The rules that are violated if a function of the plugin raises an exception for a valid frame.
-FAILING_RULES = ("LS213", "LS214", "LS215", "LS414")
+#: The rules that are violated if decoding a valid frame raises an exception.
+FAILING_RULES = ("LS213", "LS214", "LS215", "LS216", "LS414")
 
 #: Attributes of a sensor that determine the result of decoding a stream.
 DECODING_ATTRIBUTES = (
@@ -179,7 +179,13 @@ PROPERTIES = (
     Property(frames.every_single_bit_error_is_seen, "frame", "LS310"),
     Property(vectors.every_checksum_is_checked, "frame", "LS212"),
     Property(vectors.the_status_is_proven, "sensor", "LS710"),
-    Property(vectors.vectors_hold, "vector", "LS706", lacks=vectors.describe_missing_vectors),
+    Property(
+        vectors.vectors_hold,
+        "vector",
+        "LS706",
+        lacks=vectors.describe_missing_vectors,
+        unless=("LS216",),
+    ),
     Property(
         vectors.every_data_field_is_pinned_down,
         "data",
@@ -194,7 +200,13 @@ PROPERTIES = (
         lacks=vectors.describe_missing_vectors,
         unless=("LS702", "LS703", "LS707"),
     ),
-    Property(geometry.clouds_keep_the_conventions, "data", "LS501", depends_on=DECODING_ATTRIBUTES),
+    Property(
+        geometry.clouds_keep_the_conventions,
+        "data",
+        "LS501",
+        unless=("LS216",),
+        depends_on=DECODING_ATTRIBUTES,
+    ),
     Property(geometry.directions_are_radians, "data", "LS502", unless=FAILING_RULES),
     Property(
         geometry.a_single_point_has_a_direction,
@@ -222,7 +234,7 @@ PROPERTIES = (
         "data",
         "LS506",
         lacks=_no_sweep,
-        unless=(*FAILING_RULES, "LS216", "LS502"),
+        unless=(*FAILING_RULES, "LS502"),
     ),
     Property(geometry.counters_run_on, "data", "LS509", lacks=_no_sweep, unless=FAILING_RULES),
     Property(
@@ -256,7 +268,11 @@ PROPERTIES = (
         depends_on=DECODING_ATTRIBUTES,
     ),
     Property(
-        streams.a_clean_input_loses_nothing, "sensor", "LS401", depends_on=DECODING_ATTRIBUTES
+        streams.a_clean_input_loses_nothing,
+        "sensor",
+        "LS401",
+        unless=("LS216",),
+        depends_on=DECODING_ATTRIBUTES,
     ),
     Property(
         streams.scans_do_not_depend_on_batches,

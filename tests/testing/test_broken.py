@@ -83,6 +83,7 @@ DECLARED = {
     "out_of_reach": {"LS210"},
     "interpreted": {"LS116"},
     "no_such_flag": {"LS216"},
+    "clock_without_unit": {"LS216"},
     "and_in_plausible": {"LS213"},
     "and_in_points": {"LS213"},
     "without_parentheses": {"LS213"},
