@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dis
 import inspect
+import math
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import fields, replace
@@ -19,6 +20,8 @@ from lidarspec.frames.layout import Layout
 from lidarspec.frames.schema import without_indices
 from lidarspec.framing.example_frames import make_random_header, random_frame, return_raw
 from lidarspec.framing.frame_engine import CompiledCodec, get_codec
+from lidarspec.packets.clocks import clock_fields
+from lidarspec.packets.packet_type import find_clock
 from lidarspec.points.conventions import TYPES
 from lidarspec.simulation.scenes import Room
 from lidarspec.simulation.simulator import frame_simulation
@@ -65,6 +68,8 @@ WEAK_BITS_IN_DATAGRAMS = 8
 MAX_LENGTH_RATIO = 8
 #: A clock that wraps after at least this time in seconds need not declare `wraps_at`.
 LONG_WRAP_S = 7 * DAY_S
+#: Relative tolerance for rounding errors of `wraps_at` and of the scale of a clock's field.
+MAX_WRAP_ERROR = 1e-9
 #: Column of points -> possible units of its source fields.
 COLUMN_UNITS = {"range": ("m",), "azimuth": ("deg", "rad"), **dict.fromkeys("xyz", ("m",))}
 #: Pattern of the names of fields with the intensity of a return.
@@ -83,7 +88,7 @@ def check_declaration(subject: SensorUnderTest) -> list[Finding]:
     checks: list[Findings] = [
         _check_sensor(sensor),
         _check_required_fields(sensor),
-        _check_clock(sensor),
+        _check_clocks(sensor),
         _check_options(sensor),
     ]
     checks += [_check_frame(subject, name, frame) for name, frame in subject.frames.items()]
@@ -163,30 +168,41 @@ def _check_required_fields(sensor: Sensor) -> Findings:
             yield "LS216", f"the clock reads {path!r}, which has no unit of time", purpose
 
 
-def _check_clock(sensor: Sensor) -> Findings:
-    """Yield a finding if a clock wraps within days, but `wraps_at` is missing."""
-    clock = sensor.clock
-    if (
-        not isinstance(clock, Clock)
-        or callable(clock.source)
-        or clock.wraps_at is not None
-        or not sensor.data_frames
-    ):
-        return
-    named = get_codec(sensor.frames[sensor.data_frame]).schema.scan_names
-    paths = (clock.source,) if isinstance(clock.source, str) else clock.source
+def _check_clocks(sensor: Sensor) -> Findings:
+    """Yield findings for clocks with a missing or too large `wraps_at`."""
+    checked: list[Clock] = []
+    for name in (*sensor.data_frames, *sensor.incoming):
+        clock = find_clock(sensor, name)
+        if clock is not None and not callable(clock.source) and clock not in checked:
+            checked.append(clock)
+            yield from _check_wrap(sensor, name, clock)
+
+
+def _check_wrap(sensor: Sensor, name: str, clock: Clock) -> Findings:
+    """Yield a finding if the fields of a clock wrap earlier than declared."""
+    paths = clock_fields(clock)
+    named = get_codec(sensor.frames[name]).schema.scan_names
     infos = [named.get(without_indices(path)[0]) for path in paths]
-    spans = [
-        (
-            info.limits[1] * info.scale * float(factor(info.unit, "s") or 0)
-            if info and info.kind == "int"
-            else np.inf
+    span_s = sum(_find_span_s(info) for info in infos)
+    if clock.wraps_at is None and 0 < span_s < LONG_WRAP_S:
+        what = f"the clock wraps after {span_s:g} s, but wraps_at is not declared"
+        yield "LS509", what, f"{name}.{paths[0]}"
+    if clock.wraps_at is not None and clock.wraps_at > span_s * (1 + MAX_WRAP_ERROR):
+        what = (
+            f"the clock wraps after {span_s:.10g} s at the latest, but wraps_at is"
+            f" {clock.wraps_at:.10g} s"
         )
-        for info in infos
-    ]
-    if 0 < sum(spans) < LONG_WRAP_S:
-        what = f"the clock wraps after {sum(spans):g} s, but wraps_at is not declared"
-        yield "LS509", what, f"{sensor.data_frame}.{paths[0]}"
+        yield "LS509", what, f"{name}.{paths[0]}"
+
+
+def _find_span_s(info: FieldInfo | None) -> float:
+    """Return the seconds after which an integer field of a clock wraps; inf if unknown."""
+    if info is None or info.kind != "int":
+        return math.inf
+    unit_s = factor(info.unit, "s")
+    if unit_s is None:
+        return math.inf
+    return float(info.physical(info.limits[1]) + info.scale) * float(unit_s)
 
 
 def _check_options(sensor: Sensor) -> Findings:

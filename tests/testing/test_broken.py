@@ -102,6 +102,7 @@ DECLARED = {
     "periodic_sweep_of_nothing": {"LS508"},
     "sweep_in_raw_steps": {"LS514"},
     "wrap_too_early": {"LS512"},
+    "wrap_too_late": {"LS509"},
     "times_in_milliseconds": {"LS513"},
     "no_wrap_aligned": {"LS504"},
     "option_unread": {"LS217"},

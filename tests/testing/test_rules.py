@@ -25,6 +25,7 @@ from lidarspec.entry_points import SENSORS, EntryPoint
 from lidarspec.plugins import Registry
 from lidarspec.spec import (
     Checksummed,
+    Clock,
     Command,
     Fields,
     Frame,
@@ -211,3 +212,13 @@ def test_a_report_counts_the_checks_that_a_fatal_finding_stops() -> None:
     assert report.held == 0
     assert len(report.skipped) == len(PROPERTIES) - 1
     assert report.skipped["replies_can_match"] == "not tested because of LS301"
+
+
+@pytest.mark.parametrize(
+    ("wraps_at", "codes"), [(None, {"LS509"}), (50.0, set()), (65.536, set()), (65.6, {"LS509"})]
+)
+def test_the_declared_wrap_of_a_clock_fits_its_field(
+    wraps_at: float | None, codes: set[str]
+) -> None:
+    sensor = sound.sensor(clock=Clock("time", wraps_at=wraps_at))  # a field of 16 bits, in ms
+    assert declared_codes(sensor) == codes
