@@ -7,6 +7,7 @@ counters and the time of a simulated packet.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,10 @@ from lidarspec.errors import LidarSpecError
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.packets.clocks import clock_ns
 from lidarspec.packets.masked_sector import FULL_TURNS
+from lidarspec.packets.packet_type import find_clock
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.simulator import FramesWithoutPoints, find_periodic_rates
-from lidarspec.spec import Clock
+from lidarspec.spec import Sensor
 from lidarspec.spec.tree import FieldInfo, to_exact
 from lidarspec.testing.findings import ViolationError, require
 from lidarspec.testing.geometry import (
@@ -42,20 +44,39 @@ MAX_SPREAD_STEPS = 30
 SHIFT_COUNT = 24
 
 
+def list_simulated_frames(sensor: Sensor) -> list[str]:
+    """Return the compiled types of data frames and periodic frames that have a `sweep`."""
+    return [
+        name
+        for name in (*sensor.data_frames, *find_periodic_rates(sensor))
+        if sensor.simulation_of(name).sweep and get_codec(sensor.frames[name]).is_compiled
+    ]
+
+
+def periodic_frames_can_be_simulated(subject: SensorUnderTest, name: str) -> None:
+    """Check that a frame without points can be simulated if it is sent periodically."""
+    if not get_codec(subject.sensor.frames[name]).is_compiled:
+        return
+    try:
+        FramesWithoutPoints(subject.sensor).make_frame(name, 0)
+    except LidarSpecError as error:
+        raise ViolationError("LS508", str(error), f"{name}.sweep") from error
+
+
 def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
     """Check that the clock of simulated packets stays below `wraps_at`.
 
     Some packets have such high numbers in the sweep that the clock has wrapped before them.
     """
-    clock = subject.sensor.clock
+    clock = find_clock(subject.sensor, name)
     sweep = subject.sensor.simulation_of(name).sweep
-    if sweep is None or not isinstance(clock, Clock) or clock.wraps_at is None:
+    if sweep is None or clock is None or clock.wraps_at is None:
         return
     try:
         maker = FrameMaker(subject.sensor, name)
         frames = maker.make_frames(maker.table([sweep(number) for number in FAR_PACKETS]))
         packets = decode_frames(subject, name, frames, by_clock=False)
-        readings = clock_ns(subject.sensor, packets.batch())
+        readings = clock_ns(replace(subject.sensor, clock=clock), packets.batch())
     except LidarSpecError:  # another property reports the failure
         return
     most = int(readings.max(initial=0))
@@ -85,17 +106,6 @@ def sweep_values_fit_their_fields(subject: SensorUnderTest, name: str) -> None:
                     f" {low:g} to {high:g} {info.unit}",
                     f"{name}.{path}",
                 )
-
-
-def periodic_frames_can_be_simulated(subject: SensorUnderTest, name: str) -> None:
-    """Check that a frame without points can be simulated if it is sent periodically."""
-    sensor = subject.sensor
-    if name not in find_periodic_rates(sensor) or not get_codec(sensor.frames[name]).is_compiled:
-        return
-    try:
-        FramesWithoutPoints(sensor).make_frame(name, 0)
-    except LidarSpecError as error:
-        raise ViolationError("LS508", str(error), f"{name}.sweep") from error
 
 
 def _is_limited(info: FieldInfo) -> bool:

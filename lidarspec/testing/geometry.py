@@ -27,6 +27,7 @@ from lidarspec.frames.frame_table import CompiledTable
 from lidarspec.framing.example_frames import make_random_header, random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.packets.masked_sector import FULL_TURNS
+from lidarspec.packets.packet_type import find_clock
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.conventions import axis_matrix
@@ -118,7 +119,7 @@ def make_sweep(
 def decode_frames(
     subject: SensorUnderTest, name: str, frames: list[bytes], *, by_clock: bool = True
 ) -> Packets:
-    """Decode data frames of one type.
+    """Decode frames of one type.
 
     Args:
         by_clock: whether the times of packets are those of the sensor's clock; False to ignore the
@@ -128,7 +129,7 @@ def decode_frames(
         sensor = subject.sensor
     else:
         sensor = dataclasses.replace(subject.sensor, clock=None)
-    if sum(frame.data for frame in sensor.frames.values()) > 1:
+    if sensor.frames[name].data and len(sensor.data_frames) > 1:
         sensor = sensor.configure(answer=name)
     return sensor.decode(frames if sensor.datagrams else b"".join(frames), name)
 
@@ -470,7 +471,8 @@ def _have_equal_packets(angles: NDArray[np.float64], packets: NDArray[np.intp]) 
 
 def counters_run_on(subject: SensorUnderTest, name: str) -> None:
     """Check that neither the counter nor the clock goes back in packets of the sweep."""
-    if name != subject.sensor.data_frame:
+    is_data = subject.sensor.frames[name].data
+    if is_data and name != subject.sensor.data_frame:
         return
     frames = make_sweep(
         subject,
@@ -481,7 +483,7 @@ def counters_run_on(subject: SensorUnderTest, name: str) -> None:
     if not frames:
         return
     packets = decode_frames(subject, name, frames)
-    if subject.sensor.sequence is not None:
+    if subject.sensor.sequence is not None and is_data:
         # The clock would compensate for the counter.
         stats = decode_frames(subject, name, frames, by_clock=False).stats
         message = (
@@ -494,7 +496,7 @@ def counters_run_on(subject: SensorUnderTest, name: str) -> None:
             message,
             f"{name}.{subject.sensor.sequence.field}",
         )
-    if subject.sensor.clock is not None and len(packets) > 1:
+    if find_clock(subject.sensor, name) is not None and len(packets) > 1:
         back = np.diff(packets.time_ns)
         index = int(back.argmin())
         require(

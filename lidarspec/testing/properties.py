@@ -13,7 +13,9 @@ from pathlib import Path
 
 from lidarspec.errors import SpecError
 from lidarspec.framing.frame_engine import get_codec
+from lidarspec.simulation.simulator import find_periodic_rates
 from lidarspec.testing import commands, consistency, frames, geometry, streams, vectors
+from lidarspec.testing.consistency import list_simulated_frames
 from lidarspec.testing.findings import Finding, ViolationError
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
@@ -25,6 +27,8 @@ def _no_points(subject: SensorUnderTest) -> str:
 
 
 def _no_sweep(subject: SensorUnderTest) -> str:
+    if not subject.sensor.has_points:
+        return _no_points(subject)
     names = subject.sensor.data_frames
     if not any(subject.sensor.simulation_of(name).sweep for name in names):
         return "the sensor cannot be simulated, because it declares no `sweep`"
@@ -35,6 +39,20 @@ def _no_sweep(subject: SensorUnderTest) -> str:
             f" {', '.join(alone)}"
         )
     return ""
+
+
+def _no_simulated_frames(subject: SensorUnderTest) -> str:
+    if list_simulated_frames(subject.sensor):
+        return ""
+    if subject.sensor.has_points:
+        return _no_sweep(subject)
+    return "no frame type declares a `sweep` and a `rate`"
+
+
+def _no_periodic_frames(subject: SensorUnderTest) -> str:
+    if find_periodic_rates(subject.sensor):
+        return ""
+    return "no frame type without points declares a `rate`"
 
 
 def _no_commands(subject: SensorUnderTest) -> str:
@@ -59,8 +77,9 @@ class Property:
     Attributes:
         function: raises an exception if the property does not hold. Its arguments are the subject
             and, unless `each` is "sensor", the name of a frame, data frame, command or vector.
-        each: "sensor", "frame", "data" (a data frame), "command" or "vector": the function is
-            called for each of these.
+        each: "sensor", "frame", "data" (a data frame), "periodic" (a frame type without points that
+            the sensor sends periodically), "simulated" (a data frame or a periodic frame with a
+            `sweep`), "command" or "vector": the function is called for each of these.
         rule: the code of the rule that is violated if the function raises a plain `AssertionError`.
         lacks: a function that returns the reason why the property does not apply to a sensor, or ""
             if it applies.
@@ -92,6 +111,8 @@ class Property:
         names = {
             "frame": subject.frames,
             "data": subject.sensor.data_frames,
+            "periodic": find_periodic_rates(subject.sensor),
+            "simulated": list_simulated_frames(subject.sensor),
             "command": subject.commands,
         }
         return [(name,) for name in names[self.each]]
@@ -236,7 +257,20 @@ PROPERTIES = (
         lacks=_no_sweep,
         unless=(*FAILING_RULES, "LS502"),
     ),
-    Property(geometry.counters_run_on, "data", "LS509", lacks=_no_sweep, unless=FAILING_RULES),
+    Property(
+        consistency.periodic_frames_can_be_simulated,
+        "periodic",
+        "LS508",
+        lacks=_no_periodic_frames,
+        unless=FAILING_RULES,
+    ),
+    Property(
+        geometry.counters_run_on,
+        "simulated",
+        "LS509",
+        lacks=_no_simulated_frames,
+        unless=(*FAILING_RULES, "LS508"),
+    ),
     Property(
         consistency.turned_angles_turn_the_points,
         "data",
@@ -246,12 +280,18 @@ PROPERTIES = (
     ),
     Property(
         consistency.the_clock_stays_below_its_wrap,
-        "data",
+        "simulated",
         "LS512",
-        lacks=_no_sweep,
-        unless=(*FAILING_RULES, "LS509"),
+        lacks=_no_simulated_frames,
+        unless=(*FAILING_RULES, "LS508", "LS509"),
     ),
-    Property(consistency.sweep_values_fit_their_fields, "data", "LS514", lacks=_no_sweep),
+    Property(
+        consistency.sweep_values_fit_their_fields,
+        "simulated",
+        "LS514",
+        lacks=_no_simulated_frames,
+        unless=("LS508",),
+    ),
     Property(
         consistency.times_of_points_fit_the_clock,
         "data",
@@ -289,7 +329,6 @@ PROPERTIES = (
         lacks=_no_sweep,
         unless=("LS201", "LS218", *FAILING_RULES, "LS502", "LS415", "LS503"),
     ),
-    Property(consistency.periodic_frames_can_be_simulated, "frame", "LS508", unless=FAILING_RULES),
     Property(commands.a_command_parses_back, "command", "LS601", lacks=_no_commands),
     Property(commands.arguments_outside_ranges_are_errors, "command", "LS602", lacks=_no_commands),
     Property(commands.replies_can_match, "command", "LS603", lacks=_no_commands),

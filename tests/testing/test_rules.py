@@ -16,6 +16,7 @@ from construct import (
     Int8ul,
     Int16sl,
     Int16ul,
+    Int32ul,
     Struct,
     this,
 )
@@ -31,6 +32,7 @@ from lidarspec.spec import (
     Frame,
     Polar,
     Scaled,
+    Serial,
     Simulation,
     Sum,
     Udp,
@@ -222,3 +224,46 @@ def test_the_declared_wrap_of_a_clock_fits_its_field(
 ) -> None:
     sensor = sound.sensor(clock=Clock("time", wraps_at=wraps_at))  # a field of 16 bits, in ms
     assert declared_codes(sensor) == codes
+
+
+IMU_CLOCK_WRAP_S = 4294.967296  # 32 bits of microseconds
+
+
+@pytest.mark.parametrize(
+    ("sweep", "wraps_at", "codes"),
+    [
+        (lambda i: {"time": i / 100 % IMU_CLOCK_WRAP_S}, IMU_CLOCK_WRAP_S, set()),
+        (lambda i: {"tim": i / 100}, IMU_CLOCK_WRAP_S, {"LS508"}),
+        (lambda i: {"time": 100 - i / 100}, IMU_CLOCK_WRAP_S, {"LS509"}),
+        (lambda i: {"time": i / 100 % IMU_CLOCK_WRAP_S}, None, {"LS509"}),
+        (lambda i: {"time": i / 100 % IMU_CLOCK_WRAP_S}, 1000 * IMU_CLOCK_WRAP_S, {"LS509"}),
+        (lambda i: {"time": i / 100 % IMU_CLOCK_WRAP_S}, IMU_CLOCK_WRAP_S / 1000, {"LS512"}),
+        (
+            lambda i: {"time": i / 100 % IMU_CLOCK_WRAP_S, "turn": 400.0},
+            IMU_CLOCK_WRAP_S,
+            {"LS514"},
+        ),
+    ],
+)
+def test_periodic_frames_of_a_sensor_without_points_are_checked(
+    sweep: Any, wraps_at: float | None, codes: set[str]
+) -> None:
+    struct = Struct(
+        "header" / Const(b"\x1d\xa8\x51"),
+        "time" / Scaled(Int32ul, 1e-6, "s"),
+        "turn" / Scaled(Int16sl, 0.01, "deg/s"),
+        "end" / Const(b"\x33\x34"),
+    )
+    sensor = Sensor(
+        "acme-imu",
+        vendor="Acme",
+        model="IMU",
+        frames={"imu": Frame(struct, simulation=Simulation(sweep, rate=100))},
+        links={"data": Serial(115_200)},
+        clock=Clock("time", wraps_at=wraps_at),
+        status="manual",
+        source="invented for the test",
+    )
+    (report,) = check.iter_reports(check.CheckTarget([sensor]), sensor.id, examples=4)
+    assert {finding.code for finding in report.findings} == codes
+    assert "declares no `sweep`" not in " ".join(report.skipped.values())
