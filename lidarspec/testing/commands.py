@@ -15,6 +15,7 @@ from lidarspec.frames.schema import make_schema
 from lidarspec.framing.results import Found
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SimulatedDevice
+from lidarspec.spec import Command, Http
 from lidarspec.spec.arguments import Address, Choice, Range, Text
 from lidarspec.spec.enum_values import find_code
 from lidarspec.spec.links import is_datagram
@@ -183,6 +184,45 @@ def replies_can_match(subject: SensorUnderTest, name: str) -> None:
             f"no reply has a field {path!r}",
             f"commands.{name}",
         )
+
+
+def replies_belong_to_one_command(subject: SensorUnderTest, name: str) -> None:
+    """Check that the reply to another command is not accepted, if a field distinguishes them.
+
+    The field has to be in both commands and in their reply, and the commands have to give it
+    different fixed values. The replies of many protocols have no such field.
+    """
+    command = subject.sensor.commands[name]
+    for other_name, other in subject.sensor.commands.items():
+        if not _accepts_replies_to(subject.sensor, command, other):
+            continue
+        for reply in (one for one in command.replies if one in other.replies):
+            for path, info in subject.fields(reply).items():
+                is_fixed = path in command.fixed and path in other.fixed
+                if not is_fixed or path in command.matches or info.const is not None:
+                    continue
+                require(
+                    command.fixed[path] == other.fixed[path],
+                    "LS606",
+                    f"the reply {reply} contains {path}, which distinguishes the commands {name}"
+                    f" and {other_name}, but {name} does not compare it",
+                    f"commands.{name}",
+                )
+
+
+def _accepts_replies_to(sensor: Sensor, command: Command, other: Command) -> bool:
+    """Return whether a command may accept a reply to another command, if the types are equal.
+
+    The reply to an HTTP request always belongs to the request.
+    """
+    if command.link != other.link or isinstance(sensor.links[command.link], Http):
+        return False
+    if command.echoes:
+        return False
+    return not any(
+        path in other.matches and value != other.matches[path]
+        for path, value in command.matches.items()
+    )
 
 
 def the_simulated_sensor_answers(subject: SensorUnderTest, name: str) -> None:

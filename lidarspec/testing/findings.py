@@ -128,6 +128,8 @@ LS603 no reply can match the command | the command waits until its timeout | use
 LS604 the simulated sensor does not send the documented reply | simulated commands time out | declare answers=, or other matches=
 LS605 a command or reply differs from its vector | the sensor expects or sends other bytes
       | compare values, args, matches and echoes
+LS606 the reply to another command is accepted | a late reply to the other command counts as success
+      | declare echoes=, or the value of the field in matches=
 LS701 a vector has no source | readers cannot verify it | add "source": "manual, section"
 LS702 a vector cannot be read | it tests nothing | write {"frame": ..., "hex": ..., "values": {...}, "source": ...}
 LS703 the checksum covers the wrong bytes | all frames of a real sensor are rejected | compare over= and the algorithm with the manual

@@ -332,6 +332,7 @@ PROPERTIES = (
     Property(commands.a_command_parses_back, "command", "LS601", lacks=_no_commands),
     Property(commands.arguments_outside_ranges_are_errors, "command", "LS602", lacks=_no_commands),
     Property(commands.replies_can_match, "command", "LS603", lacks=_no_commands),
+    Property(commands.replies_belong_to_one_command, "command", "LS606", lacks=_no_commands),
     Property(
         commands.the_simulated_sensor_answers,
         "command",

@@ -112,6 +112,7 @@ DECLARED = {
     "unknown_field": {"LS601"},
     "reply_without_field": {"LS603"},
     "silent_command": {"LS604"},
+    "shared_reply": {"LS606"},
     "by_vectors/wrong_value": {"LS706"},
     "by_vectors/wrong_header": {"LS707"},
     "by_vectors/turned": {"LS708"},

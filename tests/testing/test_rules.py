@@ -39,7 +39,7 @@ from lidarspec.spec import (
     Xor,
 )
 from lidarspec.testing import check
-from lidarspec.testing.commands import the_simulated_sensor_answers
+from lidarspec.testing.commands import replies_belong_to_one_command, the_simulated_sensor_answers
 from lidarspec.testing.declaration import check_declaration
 from lidarspec.testing.findings import list_unacknowledged
 from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
@@ -267,3 +267,25 @@ def test_periodic_frames_of_a_sensor_without_points_are_checked(
     (report,) = check.iter_reports(check.CheckTarget([sensor]), sensor.id, examples=4)
     assert {finding.code for finding in report.findings} == codes
     assert "declares no `sweep`" not in " ".join(report.skipped.values())
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "paths"),
+    [
+        ({}, {}, ["commands.start", "commands.stop"]),
+        ({"matches": {"code": 1}}, {}, ["commands.stop"]),
+        ({"matches": {"code": 1}}, {"matches": {"code": 2}}, []),
+        ({"echoes": ("code",)}, {"echoes": ("code",)}, []),
+    ],
+)
+def test_commands_with_the_same_reply_compare_the_field_that_distinguishes_them(
+    start: dict[str, Any], stop: dict[str, Any], paths: list[str]
+) -> None:
+    commands = {
+        "start": Command("order", {"code": 1}, reply="ack", **start),
+        "stop": Command("order", {"code": 2}, reply="ack", **stop),
+    }
+    (held,) = [one for one in PROPERTIES if one.function is replies_belong_to_one_command]
+    findings = held.findings(SensorUnderTest(sound.sensor(commands=commands)))
+    assert [finding.path for finding in findings] == paths
+    assert {finding.code for finding in findings} <= {"LS606"}
