@@ -218,6 +218,7 @@ def convert_piece(piece: FilePiece) -> Record:
                 **counts,
                 output=piece.output if first is not None else None,
                 warnings=scans.warnings,
+                unread=scans.stats.unread,
             )
     except Exception as error:  # any error, because the other pieces must be converted
         return piece.describe_failure(error)

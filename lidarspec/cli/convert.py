@@ -555,10 +555,14 @@ def _open_packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | No
 def _follow_batch(
     records: Iterable[tuple[batch.Record, bool]], folder: str, file_count: int, *, as_json: bool
 ) -> None:
-    """Print the progress and the result of a batch; exit with 1 if a piece has failed."""
+    """Print the progress and the result of a batch.
+
+    Exit with 1 if a piece has failed, or if a corrupt part of a file could not be read.
+    """
     totals: Counter[str] = Counter()
     failed: list[batch.Record] = []
     done_before = 0
+    unread = 0
     with Progress("{:.1f} files".format) as progress:
         for record, is_old in records:
             if is_old:
@@ -572,6 +576,10 @@ def _follow_batch(
             totals["pieces"] += 1
             totals["scans"] += record["scans"]
             totals["points"] += record["points"]
+            lost = record.get("unread", 0)  # records of earlier versions lack it
+            if lost:
+                progress.note(f"{record['source']} is corrupt: {lost} bytes were not read")
+                unread += lost
             progress(
                 lambda: f"{folder}: {totals['points']} points",
                 (totals["files"] + len(failed), file_count),
@@ -587,6 +595,7 @@ def _follow_batch(
         emit_json(summary, None)
     if failed:
         raise click.exceptions.Exit(FINDINGS)
+    exit_if_damaged(unread)
 
 
 def _describe_batch(totals: Counter[str], done_before: int, failed_count: int) -> str:
