@@ -567,7 +567,14 @@ def _compare_points(
     entry_key: str,
 ) -> None:
     """Check that points of a vector's frame have the columns that the vector states."""
-    cloud = decode_frames(subject, name, [data] * subject.sensor.frames[name].confirm).points()
+    packets = decode_frames(subject, name, [data] * subject.sensor.frames[name].confirm)
+    require(
+        len(packets) or not packets.stats.implausible,
+        "LS708",
+        "the frame has no points, because `plausible` rejects it",
+        f"{entry_key} {name}",
+    )
+    cloud = packets.points()
     columns_of_points = cloud.columns.keys() - {"time"}
     for index, columns in wanted.items():
         number = int(index)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from construct import (
     this,
 )
 
+import lidarspec as ls
 from lidarspec import Sensor
 from lidarspec.entry_points import SENSORS, EntryPoint
 from lidarspec.plugins import Registry
@@ -45,7 +47,7 @@ from lidarspec.testing.findings import list_unacknowledged
 from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
 from lidarspec.testing.properties import PROPERTIES
 from lidarspec.testing.sensor_under_test import SensorUnderTest
-from lidarspec.testing.vectors import every_checksum_is_checked
+from lidarspec.testing.vectors import every_checksum_is_checked, vectors_hold
 from tests.broken import interpreted, sound
 
 BROKEN = Path(__file__).resolve().parents[1] / "broken"
@@ -289,3 +291,14 @@ def test_commands_with_the_same_reply_compare_the_field_that_distinguishes_them(
     findings = held.findings(SensorUnderTest(sound.sensor(commands=commands)))
     assert [finding.path for finding in findings] == paths
     assert {finding.code for finding in findings} <= {"LS606"}
+
+
+def test_a_vector_that_plausible_rejects_has_no_points(tmp_path: Path) -> None:
+    data = ls.simulate(sound.sensor(), 1)[0].hex()
+    vector = {"frame": "data", "hex": data, "points": {"0": {"range": 1}}, "source": "made"}
+    (file := tmp_path / "vectors.json").write_text(json.dumps([vector]), encoding="utf-8")
+    sensor = sound.sensor(sound.frame(plausible=lambda f: f.count > sound.LONGEST))
+    (held,) = [one for one in PROPERTIES if one.function is vectors_hold]
+    (finding,) = held.findings(SensorUnderTest(sensor, vectors=file))
+    assert finding.code == "LS708"
+    assert finding.what == "the frame has no points, because `plausible` rejects it"
