@@ -30,6 +30,7 @@ from lidarspec.packets.returns import describe_incomplete_groups
 from lidarspec.recording.format import Header
 from lidarspec.scans.selection import format_date
 from lidarspec.sensor_operations import Sensor
+from lidarspec.transports.addresses import with_option
 from lidarspec.transports.files import (
     CaptureTransport,
     HexTransport,
@@ -39,6 +40,7 @@ from lidarspec.transports.files import (
 from lidarspec.transports.open_url import is_live, open_transport
 from lidarspec.transports.protocol import (
     Chunk,
+    Origin,
     Sender,
     Transport,
     format_sender,
@@ -323,7 +325,43 @@ def _find_sensors(contents: FileContents) -> list[SensorContent]:
     has_text = any(verdict.sample.is_text for verdict in verdicts)
     if has_text and not any(verdict.candidates for verdict in verdicts):
         contents.kind = "text"
-    return [_make_content(contents.path, verdict) for verdict in verdicts]
+    late = _identify_late_senders(contents, verdicts)
+    if late and len(verdicts) == 1:
+        verdicts = []  # `late` has the same verdict, and the source that selects its sender
+    return [
+        *(_make_content(contents.path, verdict) for verdict in verdicts),
+        *(_make_content(source, verdict) for source, verdict in late),
+    ]
+
+
+def _identify_late_senders(
+    contents: FileContents, verdicts: Sequence[Verdict]
+) -> list[tuple[str, Verdict]]:
+    """Identify the sensors that begin to send after the part that was examined.
+
+    Args:
+        verdicts: the verdicts on the examined part. If there is only one, its sender has no name.
+
+    Returns:
+        The SOURCE and the verdict of each sensor that was identified. If there is only one verdict,
+        the result is empty, or includes the sender of this verdict.
+    """
+    examined = {Origin.parse(verdict.sample.sender).host for verdict in verdicts}
+    flows = contents.flows[:MAX_LISTED_FLOWS]
+    hosts = dict.fromkeys(flow.sender[0] for flow in flows if flow.sender is not None)
+    late = [host for host in hosts if host not in examined]
+    if "?" in contents.path or (len(verdicts) == 1 and len(late) < 2):
+        return []
+    sources = [with_option(contents.path, "src", host) for host in late]
+    found = [
+        (source, verdict)
+        for source in sources
+        for verdict in identify_senders(source)
+        if verdict.candidates
+    ]
+    if len(verdicts) == 1 and len(found) < 2:
+        return []
+    return found
 
 
 def _make_content(path: str, verdict: Verdict) -> SensorContent:
