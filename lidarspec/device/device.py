@@ -667,7 +667,7 @@ def _describe_nominal(sensor: Sensor) -> str:
     files = [name for name in sensor.configure.files if name not in sensor.options]
     if files:
         return (
-            f"{text}; pass it with -O {files[0]}=FILE, or in Python"
+            f"{text}; pass it with -s {sensor.id} -O {files[0]}=FILE, or in Python"
             f" sensor.configure({files[0]}=FILE)"
         )
     if sensor.state:

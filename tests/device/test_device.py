@@ -587,7 +587,8 @@ def test_a_nominal_calibration_is_one_warning_with_a_command(
     with ls.open(path, "hesai-xt32") as device:
         assert all("nominal calibration" in repr(scan) for scan in device.scans())
         (warning,) = device.warnings
-        assert "-O calibration=FILE, or in Python sensor.configure(calibration=FILE)" in warning
+        expected = "with -s hesai-xt32 -O calibration=FILE, or in Python sensor.configure(cal"
+        assert expected in warning
     with ls.open(path, ls.sensor("hesai-xt32").configure(calibration=angles)) as device:
         assert not any("nominal" in repr(scan) for scan in device.scans())
         assert device.warnings == []
