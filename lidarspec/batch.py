@@ -527,7 +527,7 @@ def convert(
             cannot be reached, or a worker was killed.
         UsageError: for an unknown format, or if a library is missing.
     """
-    format_of(f"x.{to}")
+    format_of(f"{folder}/*.{to}")
     todo = make_pieces(
         sources, sensor, folder=folder, to=to, every_point=every_point, size=size, select=select
     )

@@ -243,7 +243,8 @@ def test_a_hostile_manifest_is_a_source_error_with_its_line(drives: Path, tmp_pa
 def test_wrong_input_is_one_line_and_leaves_nothing(drives: Path, tmp_path: Path) -> None:
     out, source = tmp_path / "out", drives / "*.bin"
     assert "no such file" in ran("convert", drives / "*.lsr", out, "--to", "parquet", code=3).stderr
-    assert "format" in ran("convert", source, out, "--to", "parket", code=2).stderr
+    refused = ran("convert", source, out, "--to", "parket", code=2).stderr
+    assert refused.startswith(f"{out}/*.parket: unknown format '.parket'; did you mean '.parquet'?")
     assert (
         "--to parquet"
         in ran("convert", drives / "long.bin", drives / "bad.bin", out, code=2).stderr

@@ -215,7 +215,7 @@ def convert(
     for name, is_requested in properties.items():
         if is_requested:
             require_feature(
-                target if suffix is None else f"{target}.{suffix.removeprefix('.')}", name
+                target if suffix is None else f"{target}/*.{suffix.removeprefix('.')}", name
             )
     if not sources:
         raise UsageError(f"Missing argument 'OUT': the output file for the points of {target}")

@@ -338,9 +338,7 @@ def selection_options(*names: str) -> Callable[[Function], Function]:
 
             given = {name: value for name in names if (value := others.pop(name)) is not None}
             if "columns" in given:
-                given["columns"] = tuple(
-                    name.strip() for name in given["columns"].split(",") if name.strip()
-                )
+                given["columns"] = _parse_columns(given["columns"])
             return function(*args, selection=Selection(**given), **others)
 
         return functools.reduce(
@@ -348,6 +346,13 @@ def selection_options(*names: str) -> Callable[[Function], Function]:
         )  # type: ignore[return-value]
 
     return options
+
+
+def _parse_columns(text: str) -> tuple[str, ...]:
+    names = [name.strip() for name in text.split(",")]
+    if not all(names) or len(set(names)) < len(names):
+        raise UsageError(f"--columns: expected different names, such as x,y,z, got {text!r}")
+    return tuple(names)
 
 
 def points_option(function: Function) -> Function:

@@ -126,6 +126,12 @@ def test_every_verb_takes_the_same_slice(drive: Path, tmp_path: Path) -> None:
         ]
 
 
+@pytest.mark.parametrize("columns", ["", "x,,y", "x,x"])
+def test_columns_have_different_names(columns: str) -> None:
+    refused = ran("read", "drive.lsr", "--columns", columns, code=2).stderr
+    assert f"expected different names, such as x,y,z, got {columns!r}" in refused
+
+
 def test_organised_points_of_several_scans_and_of_none(drive: Path, tmp_path: Path) -> None:
     failed = ran("convert", drive, tmp_path / "out.npy", "--organized", code=2)
     assert "can contain only one scan, but several are selected" in failed.stderr
