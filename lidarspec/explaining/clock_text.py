@@ -60,7 +60,8 @@ def describe_clock(report: ClockReport) -> str:
     parts = [describe_time_source(report)]
     if report.verdict.code == "not_locked":
         parts = [_describe_epoch(report)]  # the verdict names the state
-    if not math.isnan(report.error_s):
+    # the texts of these verdicts contain the offset
+    if not math.isnan(report.error_s) and report.verdict.code not in ("offset", "second_off"):
         parts.append(describe_offset(report))
     if not math.isnan(report.drift_ppm):
         parts.append(f"{report.drift_ppm:+.1f} ppm")

@@ -51,16 +51,16 @@ FINDING_TYPES = MappingProxyType(
             "let the grandmaster send TAI (ptpTimescale), with its currentUtcOffset",
         ),
         "second_off": FindingType(
-            "{value:+.3f} s off the clock of this computer: " + WRONG_SENTENCE, CHECK_NMEA
+            "{value:+.3f} s off the host's clock: " + WRONG_SENTENCE, CHECK_NMEA
         ),
         "wrong_date": FindingType(
             "the date is {days:.0f} days off: the sensor's clock was probably never set",
             CONNECT_SOURCE,
         ),
         "offset": FindingType(
-            "{value:+.3f} s off the clock of this computer",
-            "synchronize both clocks to one source; chronyc tracking shows the state of this"
-            " computer's clock",
+            "{value:+.3f} s off the host's clock",
+            "synchronize both clocks to one source; chronyc tracking, on the computer that received"
+            " the packets, shows the state of the host's clock",
         ),
         "drift": FindingType(
             "drifts by {value:+.1f} ppm",

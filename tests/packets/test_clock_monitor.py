@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.explaining.clock_text import iter_clock_rows
+from lidarspec.explaining.clock_text import describe_clock, iter_clock_rows
 from lidarspec.packets.clock_findings import FINDING_TYPES, ClockFinding
 from lidarspec.packets.clock_monitor import ClockMonitor
 from tests.clock_runs import BEGAN_S, RATE_HZ, SYNCED, TAI_S, Run, make_run, watch
@@ -112,6 +112,15 @@ def test_the_offset_shows_what_the_clock_counts(epoch: str, ahead_s: float, code
     watched = watch(packets, run.began_s)
     assert watched.monitor.report().verdict.code == code
     assert watched.findings[code] < 2
+
+
+@pytest.mark.parametrize("ahead_s", [0.0, 1.0, -12.909])
+def test_one_line_about_a_clock_contains_the_offset_once(ahead_s: float) -> None:
+    run = make_run(2, ahead_s=ahead_s)
+    packets = run.packets(SYNCED.configure(epoch="utc"))
+    text = describe_clock(watch(packets, run.began_s).monitor.report())
+    assert text.count("the host's clock") == 1
+    assert "this computer" not in text
 
 
 def test_a_clock_that_counts_from_the_hour_is_compared_within_the_hour() -> None:
