@@ -45,6 +45,9 @@ BLOCK_BYTES = 1 << 18
 HEX_SUFFIXES = {".hex", ".txt"}
 #: Suffixes of files that are read as hexadecimal text only if their content is hexadecimal.
 TEXT_SUFFIXES = {".log", ".csv", ".asc"}
+#: The minimum number of bytes at the start of standard input that have to be hexadecimal text. The
+#: first bytes of a binary stream may be hexadecimal digits by chance.
+MIN_PIPED_HEX_BYTES = 4
 
 
 class RecordingTransport(Transport):
@@ -402,7 +405,7 @@ def _is_hex_text(path: str, start: bytes) -> bool:
     """Return whether a file is hexadecimal text, by its name and its first bytes."""
     if path == "-":
         # A pipe may contain only a part of the first line yet.
-        return is_hexadecimal(start, whole=False)
+        return len(start) >= MIN_PIPED_HEX_BYTES and is_hexadecimal(start, whole=False)
     suffixes = set(Path(path.lower()).suffixes[-2:])  # compression adds a second suffix
     if suffixes & HEX_SUFFIXES:
         return True

@@ -256,10 +256,10 @@ def test_the_bytes_of_a_stream_can_be_taken_out(stream: Path, tmp_path: Path) ->
 
 def test_standard_input_gets_the_times_of_its_arrival(tmp_path: Path) -> None:
     before = time.time_ns()
-    ran("record", "-", "-o", tmp_path / "it.lsr", given=b"xyz")
+    ran("record", "-", "-o", tmp_path / "it.lsr", given=b"abc")
     with Recording(tmp_path / "it.lsr") as recording:
         assert [(item.data, before <= (item.at or 0) <= time.time_ns()) for item in recording] == [
-            (b"xyz", True)
+            (b"abc", True)
         ]
 
 
