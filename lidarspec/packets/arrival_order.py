@@ -3,11 +3,17 @@
 The packets come from byte streams, or are datagrams with neither a counter nor a clock.
 `ArrivalOrder` estimates the number of lost packets from skipped bytes, and from the clock if its
 pace is declared.
+
+A short checksum accepts some damaged packets, whose times may be wrong by any amount. A time is
+confirmed if the next packet follows it at the declared pace. If instead the next packet continues
+from the last confirmed time, the times between them were wrong, and do not count.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +22,35 @@ from lidarspec.expressions.columns import Batch
 from lidarspec.frames.arrays import broadcast_value
 from lidarspec.framing.results import Counters
 from lidarspec.packets.clocks import Times
-from lidarspec.packets.pace import MAX_STEP_NS, read_paces, shortest_pace
+from lidarspec.packets.pace import MAX_STEP_NS, Paces, read_paces, shortest_pace
 from lidarspec.packets.packets import Index
 from lidarspec.spec.timing import Clock
+
+
+@dataclass
+class UnconfirmedTimes:
+    """Consecutive packets, each at an irregular time after the packet before.
+
+    Attributes:
+        confirmed: the time of the packet before these packets, ns.
+        last: the time of the last of these packets, ns.
+        next_row: the row of the packet that follows them.
+        packets: the number of these packets.
+        lost: the number of packets counted as lost since the confirmed time.
+        skipped: the number of packets lost since then according to skipped bytes.
+    """
+
+    confirmed: int
+    last: int
+    next_row: int
+    packets: int = 0
+    lost: int = 0
+    skipped: int = 0
+
+    def are_wrong(self, time: int) -> bool:
+        """Return whether the times are wrong, because the next packet is at `time`, ns."""
+        is_ascending = self.confirmed <= self.last <= time
+        return not is_ascending and 0 <= time - self.confirmed <= MAX_STEP_NS
 
 
 class ArrivalOrder:
@@ -36,6 +68,7 @@ class ArrivalOrder:
         self._grain_ns = grain_ns
         self._time: int | None = None  # of the packet that arrived last, ns
         self._index = -1  # of that packet
+        self._unconfirmed: UnconfirmedTimes | None = None  # that end with that packet
         self._largest = 1  # bytes of the largest packet so far
 
     def push(
@@ -72,6 +105,7 @@ class ArrivalOrder:
     def forget(self) -> None:
         """Forget the last clock reading, because input was lost."""
         self._time = None
+        self._unconfirmed = None
 
     def _count_skipped(
         self, batch: Batch, skipped: NDArray[np.int64]
@@ -100,14 +134,14 @@ class ArrivalOrder:
         skipped_packets: NDArray[np.int64],
     ) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
         """Return the rows after possible gaps, and the number of packets missing in each."""
-        # If the clock resolves half the pace, it is more precise than the skipped bytes. A coarse
-        # clock may miss packets, so that the larger of both estimates is used.
-        steps = np.diff(times, prepend=times.item(0) - 1 if self._time is None else self._time)
+        last = times.item(0) - 1 if self._time is None else self._time
+        steps = np.diff(times, prepend=last)
         self._time = times.item(-1)
         paces = read_paces(clock, batch)
         shortest = shortest_pace(paces)
         limit = min(shortest + max(self._grain_ns, shortest / 2), MAX_STEP_NS)
         if int(steps.min()) >= 0 and int(steps.max()) <= limit and not skipped_packets.any():
+            self._unconfirmed = None  # all times are regular
             return skipped_rows, skipped_packets
         is_odd = (steps < 0) | (steps > limit)
         is_odd[skipped_rows] = True
@@ -116,14 +150,76 @@ class ArrivalOrder:
         by_bytes[np.searchsorted(rows, skipped_rows)] = skipped_packets
         own_steps = steps[rows]
         own_paces = paces[rows]
-        tolerance = np.maximum(self._grain_ns, own_paces / 2)
-        by_clock = np.fmax(np.ceil((own_steps - tolerance) / own_paces) - 1, 0).astype(np.int64)
-        is_fine = self._grain_ns <= own_paces / 2
-        missing = np.where(is_fine, by_clock, np.maximum(by_clock, by_bytes))
         was_set = (own_steps < 0) | (own_steps > MAX_STEP_NS)
-        self._stats.lost += int(missing[~was_set].sum())
-        missing[was_set] = 1
-        return rows, missing
+        is_irregular = was_set | (self._count_missing(own_steps, own_paces, 0) > 0)
+        missing = self._count_missing(own_steps, own_paces, by_bytes)
+        missing[was_set] = 0
+        self._stats.lost += int(missing.sum())
+        self._correct_missing(
+            np.flatnonzero(is_irregular).tolist(), rows, times, steps, paces, missing, by_bytes
+        )
+        return rows, np.maximum(missing, is_irregular)
+
+    def _count_missing(self, steps: Any, paces: Any, by_bytes: Any) -> NDArray[np.int64]:
+        """Return the number of packets missing in each step of the clock, (n,).
+
+        Args:
+            steps: the steps, (n,) ns.
+            paces: the declared time between consecutive packets, (n,) ns; nan if unknown.
+            by_bytes: the number of missing packets according to skipped bytes, (n,).
+        """
+        # If the clock resolves half the pace, it is more precise than the skipped bytes. A coarse
+        # clock may miss packets, so that the larger of both estimates is used.
+        tolerance = np.maximum(self._grain_ns, paces / 2)
+        by_clock = np.fmax(np.ceil((steps - tolerance) / paces) - 1, 0).astype(np.int64)
+        is_fine = self._grain_ns <= paces / 2
+        missing: NDArray[np.int64] = np.where(is_fine, by_clock, np.maximum(by_clock, by_bytes))
+        return missing
+
+    def _correct_missing(
+        self,
+        irregular: list[int],
+        rows: NDArray[np.intp],
+        times: Times,
+        steps: Times,
+        paces: Paces,
+        missing: NDArray[np.int64],
+        by_bytes: NDArray[np.int64],
+    ) -> None:
+        """Correct the number of packets missing before and after wrong times.
+
+        Args:
+            irregular: the indices in `rows` of the packets at irregular times.
+            rows: the rows of the packets to which `missing` and `by_bytes` apply, (k,).
+            missing: the number of packets missing before each packet, (k,); it is changed.
+            by_bytes: the same number according to skipped bytes, (k,).
+        """
+        for index in irregular:
+            row = rows.item(index)
+            time = times.item(row)
+            unconfirmed = self._unconfirmed
+            if unconfirmed is None or unconfirmed.next_row != row:
+                time_before = time - steps.item(row)
+                unconfirmed = UnconfirmedTimes(time_before, time_before, row)
+                self._unconfirmed = unconfirmed
+            unconfirmed.lost += missing.item(index)
+            unconfirmed.skipped += by_bytes.item(index)
+            if unconfirmed.are_wrong(time):
+                pace = paces.item(row)
+                step = time - unconfirmed.confirmed - unconfirmed.packets * pace
+                lost = int(self._count_missing(step, pace, unconfirmed.skipped))
+                self._stats.lost += lost - unconfirmed.lost
+                unconfirmed.lost = lost
+                missing[max(index - unconfirmed.packets, 0) : index] = 0
+                missing[index] = lost
+            unconfirmed.last = time
+            unconfirmed.next_row += 1
+            unconfirmed.packets += 1
+        if self._unconfirmed is not None:
+            if self._unconfirmed.next_row == len(times):
+                self._unconfirmed.next_row = 0
+            else:
+                self._unconfirmed = None
 
 
 def _make_index_with_gaps(

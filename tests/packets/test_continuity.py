@@ -13,6 +13,8 @@ import pytest
 import lidarspec as ls
 from lidarspec import Counters, Packets, Sensor, simulate
 from lidarspec.packets.stream import PacketStream
+from lidarspec_ldrobot import CRC8
+from tests.engine.streams import damage
 from tests.representatives import load_sensor
 
 #: sensors without a counter, and what tells their packets apart.
@@ -177,6 +179,44 @@ def test_one_damaged_reading_of_the_clock_loses_nothing() -> None:
         packets = sensor.decode([*frames[:300], damaged, *frames[301:]])
         assert list_losses(packets) == (0, 0, 0)
         assert np.flatnonzero(packets.breaks).tolist() == [300, 301]
+
+
+def set_time(frame: bytes, time_ms: int) -> bytes:
+    """Return an LDROBOT data frame with another time and a valid checksum."""
+    body = frame[:-3] + time_ms.to_bytes(2, "little")
+    return body + bytes([CRC8(body)])
+
+
+@pytest.mark.parametrize("size", [1, 47, 1000, 10**6])
+@pytest.mark.parametrize("lost", [0, 400])
+@pytest.mark.parametrize(
+    "times_ms",
+    [(29_000,), (10_000,), (1_200,), (5_000, 9_000), (9_000, 5_000), (14_000, 14_500, 3)],
+)
+def test_wrong_times_with_a_valid_checksum_lose_nothing(
+    times_ms: tuple[int, ...], lost: int, size: int
+) -> None:
+    """A checksum of 8 bits accepts one of 256 damaged frames."""
+    sensor = ls.sensor("ldrobot-stl27l")
+    frames = simulate(sensor, 4000)
+    wrong = [set_time(frame, ms) for frame, ms in zip(frames[2000:], times_ms, strict=False)]
+    after = frames[2000 + len(wrong) + lost :]
+    data = b"".join([*frames[:2000], *wrong, *after])
+    decoder = sensor.decoder()
+    stream = PacketStream(sensor, "data", decoder.stats)
+    parts = [stream.add(decoder.frames(data[i : i + size])) for i in range(0, len(data), size)]
+    breaks = np.concatenate([part.breaks for part in parts])
+    assert np.flatnonzero(breaks).tolist() == list(range(2000, 2001 + len(wrong)))
+    assert decoder.stats.lost == pytest.approx(lost, abs=lost // 50)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("rate", [0.001, 0.01])
+def test_losses_in_a_damaged_stream_are_counted(rate: float, seed: int) -> None:
+    sensor = ls.sensor("ldrobot-stl27l")
+    frames = simulate(sensor, 10_000)
+    packets = sensor.decode(damage(b"".join(frames), rate, seed))
+    assert packets.stats.lost == pytest.approx(len(frames) - len(packets), rel=0.01)
 
 
 def test_clock_changes_and_restarts_are_no_loss() -> None:
