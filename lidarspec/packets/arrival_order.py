@@ -155,10 +155,11 @@ class ArrivalOrder:
         missing = self._count_missing(own_steps, own_paces, by_bytes)
         missing[was_set] = 0
         self._stats.lost += int(missing.sum())
-        self._correct_missing(
+        self._correct_lost(
             np.flatnonzero(is_irregular).tolist(), rows, times, steps, paces, missing, by_bytes
         )
-        return rows, np.maximum(missing, is_irregular)
+        missing[was_set] = 1
+        return rows, missing
 
     def _count_missing(self, steps: Any, paces: Any, by_bytes: Any) -> NDArray[np.int64]:
         """Return the number of packets missing in each step of the clock, (n,).
@@ -176,7 +177,7 @@ class ArrivalOrder:
         missing: NDArray[np.int64] = np.where(is_fine, by_clock, np.maximum(by_clock, by_bytes))
         return missing
 
-    def _correct_missing(
+    def _correct_lost(
         self,
         irregular: list[int],
         rows: NDArray[np.intp],
@@ -186,12 +187,14 @@ class ArrivalOrder:
         missing: NDArray[np.int64],
         by_bytes: NDArray[np.int64],
     ) -> None:
-        """Correct the number of packets missing before and after wrong times.
+        """Correct the number of lost packets if times were wrong.
+
+        The index of packets is not corrected, because packets before may be in an earlier batch.
 
         Args:
             irregular: the indices in `rows` of the packets at irregular times.
             rows: the rows of the packets to which `missing` and `by_bytes` apply, (k,).
-            missing: the number of packets missing before each packet, (k,); it is changed.
+            missing: the number of packets counted as lost before each packet, (k,).
             by_bytes: the same number according to skipped bytes, (k,).
         """
         for index in irregular:
@@ -210,8 +213,6 @@ class ArrivalOrder:
                 lost = int(self._count_missing(step, pace, unconfirmed.skipped))
                 self._stats.lost += lost - unconfirmed.lost
                 unconfirmed.lost = lost
-                missing[max(index - unconfirmed.packets, 0) : index] = 0
-                missing[index] = lost
             unconfirmed.last = time
             unconfirmed.next_row += 1
             unconfirmed.packets += 1

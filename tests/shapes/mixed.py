@@ -39,7 +39,7 @@ WIRE = Tokens(
 def sweep(i: int) -> dict[str, Any]:
     return {
         "talker": b"GP",
-        "time": i / 4,
+        "time": i / 4 % 3600,
         "status": b"A",
         "height": 431.5,
         "satellites": 7 + i % 3,
