@@ -161,17 +161,15 @@ class FilePiece:
     def iter_numbered(self, scans: FileScans) -> Iterator[Scan]:
         """Yield the selected scans of the piece.
 
-        `Scan.number` of each scan is its number among the selected scans of the file, from 0.
+        `Scan.number` of each scan is its number in the whole file, from 0.
 
         Args:
             scans: the reader that `open_scans` has returned.
         """
         sieve = ScanSelector(self.select, self.source)
-        number = self.first
-        for scan in itertools.islice(scans, self.count):
+        for number, scan in enumerate(itertools.islice(scans, self.count), self.first):
             if (wanted := sieve.select(scan)) is not None:
                 yield replace(wanted, number=number)
-                number += 1
             if sieve.ended:
                 break
         scans.add_warnings(sieve.warnings)

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import lidarspec as ls
@@ -99,27 +98,6 @@ def test_pieces_have_the_points_of_one_pass_and_a_bad_file_stops_no_other(
     told = next(record for record in records(tmp_path) if record["source"].endswith("a.bin"))
     assert told["points"] == pq.read_metadata(tmp_path / "north" / "a.parquet").num_rows
     assert {"size", "modified", "digest", "versions", "scans"} < told.keys()
-
-
-@pytest.mark.parametrize("suffix", ["npz", "npy"])
-def test_scan_numbers_continue_from_piece_to_piece(
-    drives: Path, whole: Any, tmp_path: Path, suffix: str
-) -> None:
-    done = list(batch.convert([str(drives / "long.bin")], str(tmp_path), suffix, SENSOR, size=SIZE))
-    assert len(done) > 1
-    pieces = [np.load(path)["scan"] for path in sorted(tmp_path.glob(f"*.{suffix}"))]
-    np.testing.assert_array_equal(np.concatenate(pieces), whole["scan"])
-
-
-def test_scan_numbers_count_the_selected_scans(drives: Path, tmp_path: Path) -> None:
-    select = ls.Selection(scans=(5, 8))
-    source = drives / "long.bin"
-    run(source, tmp_path, select=select)
-    in_batch = pq.read_table(tmp_path / "long.parquet")
-    assert set(in_batch["scan"].to_pylist()) == {0, 1, 2}
-    with ls.open(source, SENSOR) as device:
-        write(tmp_path / "plain.parquet", device.scans(select=select))
-    assert pq.read_table(tmp_path / "plain.parquet").equals(in_batch)
 
 
 @pytest.mark.slow

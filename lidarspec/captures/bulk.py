@@ -263,21 +263,13 @@ class CapturedDatagrams:
         """Return only the datagrams from senders that match `origin`."""
         if all(name in origin for name in self.names):
             return self
-        return self.select(np.array([name in origin for name in self.names], np.bool_))
-
-    def select(self, wanted: NDArray[np.bool_]) -> CapturedDatagrams:
-        """Return only the datagrams from some senders.
-
-        Args:
-            wanted: whether to select the datagrams of each sender in `names`.
-        """
-        mask = wanted[self.senders]
+        wanted = np.array([name in origin for name in self.names], np.bool_)[self.senders]
         return CapturedDatagrams(
             self.buffer,
-            self.starts[mask],
-            self.sizes[mask],
-            self.at[mask],
-            self.senders[mask],
+            self.starts[wanted],
+            self.sizes[wanted],
+            self.at[wanted],
+            self.senders[wanted],
             self.names,
         )
 

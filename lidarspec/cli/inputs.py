@@ -7,6 +7,7 @@ imported inside functions, so that verbs start quickly.
 from __future__ import annotations
 
 import contextlib
+import io
 import itertools
 import math
 import os
@@ -43,7 +44,7 @@ from lidarspec.plugins import sensors
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Times, iter_received
 from lidarspec.sensor_operations import Sensor
-from lidarspec.transports.hex_text import parse_hex
+from lidarspec.transports.hex_text import is_hexadecimal, iter_hex_chunks, parse_hex
 from lidarspec.transports.protocol import Chunk, no_bytes_message
 
 if TYPE_CHECKING:
@@ -156,9 +157,22 @@ def _read_rest(source: str, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
 
 
 def _iter_standard_input(file: FileTransport) -> Iterator[Chunk]:
-    """Yield the bytes of standard input; the first chunk is smaller, so that it arrives early."""
-    yield Chunk(sys.stdin.buffer.read(MAX_SAMPLE_BYTES))
-    yield from file.chunks()
+    """Yield the bytes of standard input as they arrive; hexadecimal text is converted."""
+    head = sys.stdin.buffer.read(MAX_SAMPLE_BYTES)
+    stdin = sys.stdin.buffer
+    if not is_hexadecimal(head, whole=len(head) < MAX_SAMPLE_BYTES):
+        yield Chunk(head)
+        yield from file.chunks()
+        return
+    looked_at = io.BytesIO(head)
+
+    def readline(size: int) -> bytes:
+        line = looked_at.readline(size)
+        if line.endswith(b"\n") or len(line) == size:
+            return line
+        return line + stdin.readline(size - len(line))
+
+    yield from iter_hex_chunks("standard input", readline)
 
 
 def read_sample(words: Sequence[str]) -> SampleBytes:

@@ -221,27 +221,6 @@ def _decode_stream(
         yield _assign_arrival_times(decoder.frames(data[start : start + size]), ends, times)
 
 
-def _decode_placed(decoder: Decoder, datagrams: CapturedDatagrams) -> Frames:
-    """Return the frames in captured datagrams."""
-    return decoder.decode_placed(datagrams.buffer, datagrams.starts, datagrams.sizes, datagrams.at)
-
-
-def _decode_captured(
-    decoder: Decoder, senders: SenderCheck, datagrams: CapturedDatagrams
-) -> Frames:
-    """Return the frames in captured datagrams, and check that one sensor sent them."""
-    frames = _decode_placed(decoder, datagrams)
-    senders.check(datagrams.iter_frame_senders(frames))
-    return frames
-
-
-def _decode_datagrams(decoder: Decoder, senders: SenderCheck, chunks: Sequence[Chunk]) -> Frames:
-    """Return the frames in datagrams, and check that one sensor sent them."""
-    [frames] = decode_chunks(decoder, chunks)
-    senders.check(find_frame_senders(chunks, frames, decoder.stats.bytes_in))
-    return frames
-
-
 def _assign_arrival_times(
     batches: Iterable[Frames], ends: NDArray[np.int64], times: NDArray[np.int64]
 ) -> list[Frames]:
@@ -290,8 +269,6 @@ class FileInput(DeviceInput):
         self._transport = opened
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=backend)
         self.senders = SenderCheck(source, sensor)
-        # Searches for frames of the sensor in the datagrams of other senders.
-        self._probe: Decoder = sensor.decoder(stream=not opened.datagrams, backend=backend)
         self._batch_bytes = 0  # 0: BATCH_BYTES
         self._frame_batches = self._iter_frame_batches()
 
@@ -301,7 +278,7 @@ class FileInput(DeviceInput):
 
     @property
     def warnings(self) -> list[str]:
-        warnings = [*self._transport.warnings, *self.senders.warnings]
+        warnings = list(self._transport.warnings)
         stats = self.decoder.stats
         if (
             self.state == "ended"
@@ -316,7 +293,7 @@ class FileInput(DeviceInput):
     @property
     def stats(self) -> Counters:
         stats = self.decoder.stats
-        stats.foreign = self._transport.foreign + self.senders.foreign
+        stats.foreign = self._transport.foreign
         stats.disconnects = self._transport.disconnects
         stats.unread = self._transport.unread
         return stats
@@ -372,7 +349,10 @@ class FileInput(DeviceInput):
         with contextlib.closing(open_transport(self._source)) as source:
             decoder = self.sensor.decoder(stream=not source.datagrams)
             if isinstance(source, CaptureTransport) and source.datagrams:
-                batches = ([_decode_placed(decoder, batch)] for batch in source.batches())
+                batches = (
+                    [decoder.decode_placed(batch.buffer, batch.starts, batch.sizes, batch.at)]
+                    for batch in source.batches()
+                )
                 return find_first_frames(self.sensor, batches)
             return find_first_frames(
                 self.sensor, (decode_chunks(decoder, [chunk]) for chunk in source.chunks())
@@ -393,75 +373,23 @@ class FileInput(DeviceInput):
                 for part in (
                     datagrams.parts(self._batch_bytes) if self._batch_bytes else [datagrams]
                 ):
-                    yield FrameBatch(
-                        [_decode_captured(self.decoder, self.senders, self._select_captured(part))]
+                    frames = self.decoder.decode_placed(
+                        part.buffer, part.starts, part.sizes, part.at
                     )
+                    self.senders.check(part.iter_frame_senders(frames))
+                    yield FrameBatch([frames])
             yield FrameBatch(self.decoder.take_pending())
             return
         for chunks in self._iter_chunk_batches():
             if chunks[0].gap or chunks[0].quiet:
                 yield FrameBatch(self.decoder.take_pending(), interrupted=chunks[0].gap)
-            if self.decoder.stream:
-                yield FrameBatch(decode_chunks(self.decoder, chunks))
-            else:
-                mine = self._select_chunks(chunks)
-                yield FrameBatch([_decode_datagrams(self.decoder, self.senders, mine)])
+            batches = decode_chunks(self.decoder, chunks)
+            if not self.decoder.stream:
+                self.senders.check(
+                    find_frame_senders(chunks, batches[0], self.decoder.stats.bytes_in)
+                )
+            yield FrameBatch(batches)
         yield FrameBatch(self.decoder.take_pending())
-
-    def _select_captured(self, datagrams: CapturedDatagrams) -> CapturedDatagrams:
-        """Return the datagrams that the sensor sent, and count those of other devices.
-
-        Raises:
-            UsageError: if another device also sends frames of the sensor.
-        """
-        if not self.senders.may_include_others(datagrams.names):
-            return datagrams
-        if self.senders.address is None:
-            for part in datagrams.parts(BATCH_BYTES):
-                frames = _decode_placed(self._probe, part)
-                for _, sender in part.iter_frame_senders(frames):
-                    self.senders.choose(sender)
-                if self.senders.address is not None:
-                    break
-        address = self.senders.address
-        if address is None:
-            return datagrams
-        is_sensor = np.array([name[0] == address[0] for name in datagrams.names], np.bool_)
-        others = datagrams.select(~is_sensor)
-        _decode_captured(self._probe, self.senders, others)
-        for sender, count in zip(
-            others.names, np.bincount(others.senders, minlength=len(others.names)), strict=True
-        ):
-            self.senders.count_others(sender[0], int(count))
-        return datagrams.select(is_sensor)
-
-    def _select_chunks(self, chunks: list[Chunk]) -> list[Chunk]:
-        """Return the datagrams that the sensor sent, and count those of other devices.
-
-        Raises:
-            UsageError: if another device also sends frames of the sensor.
-        """
-        senders = {chunk.sender for chunk in chunks if chunk.sender is not None}
-        if not self.senders.may_include_others(senders):
-            return chunks
-        if self.senders.address is None:
-            [frames] = decode_chunks(self._probe, chunks)
-            end = self._probe.stats.bytes_in
-            for _, sender in find_frame_senders(chunks, frames, end):
-                self.senders.choose(sender)
-        address = self.senders.address
-        if address is None:
-            return chunks
-        mine = list[Chunk]()
-        others = list[Chunk]()
-        for chunk in chunks:
-            if chunk.sender is None or chunk.sender[0] == address[0]:
-                mine.append(chunk)
-            else:
-                others.append(chunk)
-                self.senders.count_others(chunk.sender[0], 1)
-        _decode_datagrams(self._probe, self.senders, others)
-        return mine
 
     def _iter_chunk_batches(self) -> Iterator[list[Chunk]]:
         """Yield the chunks in batches to decode together."""

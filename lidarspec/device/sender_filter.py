@@ -3,14 +3,13 @@
 All data of a sensor comes from one IP address. The frames of one type come from one port, which may
 change after a restart. Two alternating ports belong to two sensors.
 
-For a file, `SenderCheck` raises an error if two senders send frames of the sensor, and counts the
-datagrams of senders that send none. For a live source, `SenderFilter` selects the first sender of
-data frames, and drops the datagrams of other senders.
+For a file, `SenderCheck` raises an error if two sensors send frames. For a live source,
+`SenderFilter` selects the first sender of data frames, and drops the datagrams of other senders.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from shlex import quote
 
@@ -29,52 +28,14 @@ MAX_SENDERS = 16
 
 
 class SenderCheck:
-    """Checks that all frames of a file are from one sensor.
-
-    Attributes:
-        foreign: number of datagrams of other senders so far.
-    """
+    """Checks that all frames of a file are from one sensor."""
 
     def __init__(self, source: str | Path, sensor: Sensor) -> None:
-        self.foreign = 0
         self._source = source
         self._sensor = sensor
-        self._other_hosts: dict[str, int] = {}  # address of another sender -> its datagrams
         self._address: Sender | None = None  # of the sensor
         self._current: dict[str, Sender] = {}  # sender of each frame type
         self._previous: dict[str, dict[Sender, None]] = {}  # its earlier senders, oldest first
-
-    @property
-    def address(self) -> Sender | None:
-        """The address and port of the sensor; None until a frame has arrived."""
-        return self._address
-
-    @property
-    def warnings(self) -> list[str]:
-        """The warnings about senders that were ignored."""
-        if self._address is None or not self._other_hosts:
-            return []
-        other = max(self._other_hosts, key=self._other_hosts.__getitem__)
-        chosen = quote(with_option(self._source, "src", other))
-        return [
-            f"{self._source}: reading data from {self._address[0]}, and ignoring {self.foreign}"
-            f" datagrams of other senders, such as {other}; next: lidarspec detect {chosen}"
-        ]
-
-    def may_include_others(self, senders: Collection[Sender]) -> bool:
-        """Return whether some of these senders may be other devices than the sensor."""
-        hosts = {sender[0] for sender in senders}
-        return len(hosts) > 1 or (self._address is not None and self._address[0] not in hosts)
-
-    def choose(self, sender: Sender) -> None:
-        """Select `sender` as the sensor, unless the sensor was identified before."""
-        self._address = self._address or sender
-
-    def count_others(self, host: str, count: int) -> None:
-        """Count datagrams that another device with address `host` has sent."""
-        self.foreign += count
-        if host in self._other_hosts or len(self._other_hosts) < MAX_SENDERS:
-            self._other_hosts[host] = self._other_hosts.get(host, 0) + count
 
     def check(self, sent: Iterable[tuple[str, Sender]]) -> None:
         """Check the senders of the next frames.
@@ -137,6 +98,7 @@ class SenderFilter(SenderCheck):
 
     def __init__(self, source: str | Path, sensor: Sensor, *, datagrams: bool) -> None:
         super().__init__(source, sensor)
+        self.foreign = 0
         self.has_changed = False
         self.other_sender: Sender | None = None
         self._is_sure = False
@@ -145,6 +107,11 @@ class SenderFilter(SenderCheck):
         self._probes: dict[Sender, Decoder] = {}
         # Ports of other sensors at the address of the sensor.
         self._other_senders: dict[Sender, None] = {}
+
+    @property
+    def address(self) -> Sender | None:
+        """The address and port of the sensor; None until a frame has arrived."""
+        return self._address
 
     def configure(self, sensor: Sensor) -> None:
         """Search for frames of a newly configured sensor from now on."""

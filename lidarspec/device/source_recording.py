@@ -75,9 +75,7 @@ class LimitedRecorder:
 
     Attributes:
         first: arrival time of the first recorded chunk, ns; None if nothing has arrived.
-        earliest: earliest arrival time of the recorded chunks, ns; None if nothing has arrived. In
-            a corrupt capture, times may go back.
-        last: latest arrival time of the recorded chunks, ns; None if nothing has arrived.
+        last: arrival time of the last recorded chunk, ns; None if nothing has arrived.
         is_over: whether the time limit has passed.
     """
 
@@ -88,7 +86,6 @@ class LimitedRecorder:
         else:
             self._limit_ns = seconds * 1e9
         self.first: int | None = None
-        self.earliest: int | None = None
         self.last: int | None = None
         self.is_over = False
 
@@ -99,10 +96,10 @@ class LimitedRecorder:
 
     @property
     def duration(self) -> float | None:
-        """Seconds from the earliest to the latest recorded arrival; None if there is none."""
-        if self.earliest is None or self.last is None:
+        """Seconds from the first to the last recorded arrival; None if there is none."""
+        if self.first is None or self.last is None:
             return None
-        return (self.last - self.earliest) / 1e9
+        return (self.last - self.first) / 1e9
 
     def contains(self, chunk: Chunk) -> bool:
         """Return whether a received chunk was written to the file."""
@@ -117,8 +114,7 @@ class LimitedRecorder:
             if self.is_over:
                 return
             if chunk.at is not None:
-                self.earliest = min(chunk.at, self.earliest or chunk.at)
-                self.last = max(chunk.at, self.last or chunk.at)
+                self.last = chunk.at
         self._recorder.write(chunk, direction)
 
     def _check_limit(self, chunk: Chunk) -> None:

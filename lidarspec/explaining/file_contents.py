@@ -30,7 +30,6 @@ from lidarspec.packets.returns import describe_incomplete_groups
 from lidarspec.recording.format import Header
 from lidarspec.scans.selection import format_date
 from lidarspec.sensor_operations import Sensor
-from lidarspec.transports.addresses import with_option
 from lidarspec.transports.files import (
     CaptureTransport,
     HexTransport,
@@ -40,7 +39,6 @@ from lidarspec.transports.files import (
 from lidarspec.transports.open_url import is_live, open_transport
 from lidarspec.transports.protocol import (
     Chunk,
-    Origin,
     Sender,
     Transport,
     format_sender,
@@ -137,10 +135,9 @@ class FileContents:
         size: the size of the file, in bytes.
         header: the header of a recording; None for other files.
         flows: the packets by sender and receiver, most bytes first; a byte stream has one flow.
-        first_ns: earliest arrival time, ns since 1970; None if unknown. In a corrupt capture, this
-            may not be the time of the first packet.
-        last_ns: latest arrival time, ns since 1970; None if unknown.
-        last_read_ns: latest arrival time of the packets that were read; None if unknown.
+        first_ns: arrival time of the first packet, ns since 1970; None if unknown.
+        last_ns: arrival time of the last packet, ns since 1970; None if unknown.
+        last_read_ns: arrival time of the last packet that was read; None if unknown.
         whole: whether the whole file was read; if not, all counts refer to its beginning.
         unread: number of bytes that could not be read, because the file is corrupt.
     """
@@ -293,10 +290,9 @@ def _count_packets(contents: FileContents, opened: Transport) -> None:
         flow.packets += 1
         flow.bytes += len(chunk.data)
         bytes_left -= len(chunk.data)
-        if chunk.at:
-            contents.first_ns = min(chunk.at, contents.first_ns or chunk.at)
-            contents.last_ns = max(chunk.at, contents.last_ns or chunk.at)
-            contents.last_read_ns = contents.last_ns
+        if contents.first_ns is None:
+            contents.first_ns = chunk.at or None
+        contents.last_read_ns = contents.last_ns = chunk.at or contents.last_ns
         if bytes_left <= 0 or index >= MAX_BEGINNING_PACKETS:
             contents.last_ns = _find_last_time(opened, chunks)
             contents.whole = False
@@ -325,43 +321,7 @@ def _find_sensors(contents: FileContents) -> list[SensorContent]:
     has_text = any(verdict.sample.is_text for verdict in verdicts)
     if has_text and not any(verdict.candidates for verdict in verdicts):
         contents.kind = "text"
-    late = _identify_late_senders(contents, verdicts)
-    if late and len(verdicts) == 1:
-        verdicts = []  # `late` has the same verdict, and the source that selects its sender
-    return [
-        *(_make_content(contents.path, verdict) for verdict in verdicts),
-        *(_make_content(source, verdict) for source, verdict in late),
-    ]
-
-
-def _identify_late_senders(
-    contents: FileContents, verdicts: Sequence[Verdict]
-) -> list[tuple[str, Verdict]]:
-    """Identify the sensors that begin to send after the part that was examined.
-
-    Args:
-        verdicts: the verdicts on the examined part. If there is only one, its sender has no name.
-
-    Returns:
-        The SOURCE and the verdict of each sensor that was identified. If there is only one verdict,
-        the result is empty, or includes the sender of this verdict.
-    """
-    examined = {Origin.parse(verdict.sample.sender).host for verdict in verdicts}
-    flows = contents.flows[:MAX_LISTED_FLOWS]
-    hosts = dict.fromkeys(flow.sender[0] for flow in flows if flow.sender is not None)
-    late = [host for host in hosts if host not in examined]
-    if "?" in contents.path or (len(verdicts) == 1 and len(late) < 2):
-        return []
-    sources = [with_option(contents.path, "src", host) for host in late]
-    found = [
-        (source, verdict)
-        for source in sources
-        for verdict in identify_senders(source)
-        if verdict.candidates
-    ]
-    if len(verdicts) == 1 and len(found) < 2:
-        return []
-    return found
+    return [_make_content(contents.path, verdict) for verdict in verdicts]
 
 
 def _make_content(path: str, verdict: Verdict) -> SensorContent:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from lidarspec.formats.common import ColumnSpool, find_number, select_points, to_image
+from lidarspec.formats.common import ColumnSpool, select_points, to_image
 from lidarspec.formats.point_rows import COLUMN_NAMES, PointRows, write_rows
 from lidarspec.optional_libraries import import_library
 from lidarspec.points.cloud import units_of
@@ -68,19 +68,20 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bo
         numbers = column(np.int32)
         columns = dict[str, ColumnSpool]()
         units = dict[str, str]()
-        for index, scan in enumerate(scans):
+        for number, scan in enumerate(scans):
             cloud = select_points(scan, every_point=every_point)
             own = cloud.columns
             if organized:
                 height = len(to_image(cloud.valid, cloud))
                 own = {name: to_image(column, cloud).ravel() for name, column in own.items()}
-            if not index:
+            if not number:
                 columns = {name: column(values.dtype) for name, values in own.items()}
+            if not number:
                 units = {name: unit for name, unit in cloud.units.items() if unit}
             columns = {name: kept for name, kept in columns.items() if name in own}
             for name, kept in columns.items():
                 kept.add(own[name])
-            numbers.add(np.full(len(cloud), find_number(scan, index)))
+            numbers.add(np.full(len(cloud), number))
             for name, kept in scan_columns.items():
                 kept.add(np.array([getattr(scan, name)]))
         unit_columns = {f"{name}.unit": column(f"<U{len(unit)}") for name, unit in units.items()}
@@ -180,10 +181,10 @@ def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
         for name, (dtype, unit) in SCAN_COLUMNS.items()
     }
     columns = {"scan": _ZarrColumn(group, "scan", np.int32)}
-    for index, scan in enumerate(scans):
+    for number, scan in enumerate(scans):
         cloud = select_points(scan, every_point=every_point)
-        own = {**cloud.columns, "scan": np.full(len(cloud), find_number(scan, index), np.int32)}
-        if not index:
+        own = {**cloud.columns, "scan": np.full(len(cloud), number, np.int32)}
+        if not number:
             units = units_of(cloud)
             group.attrs.update(scan.facts)
             columns |= {

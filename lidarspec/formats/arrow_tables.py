@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarspec.formats.common import find_number, select_points, write_in_thread
+from lidarspec.formats.common import select_points, write_in_thread
 from lidarspec.optional_libraries import import_library
 from lidarspec.points.cloud import PointCloud, units_of
 from lidarspec.points.table_types import arrow_schema
@@ -58,7 +58,8 @@ def iter_tables(
     for index, scan in enumerate(scans):
         cloud = select_points(scan, every_point=every_point)
         schema = schema or _make_schema(scan, cloud, scan_fields)
-        batches.append(_make_batch(arrow, schema, cloud, find_number(scan, index), scan))
+        number = index if scan.number is None else scan.number
+        batches.append(_make_batch(arrow, schema, cloud, number, scan))
         row_count += len(cloud)
         if row_count >= MIN_GROUP_ROWS:
             yield _make_table(arrow, batches, schema)

@@ -106,17 +106,6 @@ def select_points(scan: Scan, *, every_point: bool) -> PointCloud:
     return scan.points[which]
 
 
-def find_number(scan: Scan, index: int) -> int:
-    """Return the number of a scan for the column `scan`.
-
-    Args:
-        index: the index of the scan in the file that is written.
-    """
-    if scan.number is None:
-        return index
-    return scan.number
-
-
 def find_points(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | None:
     """Return the indices of the points to write; None for all points."""
     if every_point or cloud.valid.all():

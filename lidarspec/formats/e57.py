@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.common import GPS_EPOCH_NS, find_number, select_columns
+from lidarspec.formats.common import GPS_EPOCH_NS, select_columns
 from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
@@ -61,12 +61,11 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
             file = pye57.E57(str(path), mode="w")
             files.callback(file.image_file.cancel)
             file.image_file.extensionsAdd(PREFIX, EXTENSION)
-            for index, scan in enumerate(scans):
+            for number, scan in enumerate(scans):
                 own = select_columns(
                     scan, (*FIELD_NAMES, *scan.points.extra), every_point=every_point
                 )
-                header = _make_header(find_number(scan, index), scan)
-                _add_scan(libe57, file, header, _convert_columns(own))
+                _add_scan(libe57, file, _make_header(number, scan), _convert_columns(own))
             file.close()
         except libe57.E57Exception as error:  # the library omits the text of system errors
             raise OSError(f"{str(error).splitlines()[0]}; is the disk full?") from None

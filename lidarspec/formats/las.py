@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, suggest
-from lidarspec.formats.common import GPS_EPOCH_NS, find_number, select_columns, write_in_thread
+from lidarspec.formats.common import GPS_EPOCH_NS, select_columns, write_in_thread
 from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
@@ -59,13 +59,13 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compresse
             do_compress=is_compressed,
             closefd=False,
         )
-        for index, scan in enumerate(scans):
+        for number, scan in enumerate(scans):
             own = select_columns(
                 scan,
                 (*STANDARD_COLUMNS, *EXTRA_COLUMNS, *scan.points.extra),
                 every_point=every_point,
             )
-            own["scan"] = np.full(len(own["x"]), find_number(scan, index), np.uint32)
+            own["scan"] = np.full(len(own["x"]), number, np.uint32)
             if writer is None:
                 extra_names = _fill_header(laspy, header, own, scan)
                 # One buffer is filled while the other is written.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.common import find_number, select_columns, to_image, write_in_thread
+from lidarspec.formats.common import select_columns, to_image, write_in_thread
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.table_types import STRUCTURED
 from lidarspec.scans.scan import Scan
@@ -79,8 +79,7 @@ class PointRows:
 
     def iter_parts(self) -> Iterator[tuple[Mapping[str, NDArray[Any]], PointCloud]]:
         """Yield the selected columns and the whole point cloud of each scan, for `fill`."""
-        for index, scan in enumerate(self._scans):
-            number = find_number(scan, index)
+        for number, scan in enumerate(self._scans):
             yield self._select_columns(scan, number, self.dtype.names or ()), scan.points
 
     def fill(self, columns: Mapping[str, NDArray[Any]], points: PointCloud) -> NDArray[Any]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.common import find_number, find_points, select_points, write_in_thread
+from lidarspec.formats.common import find_points, select_points, write_in_thread
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
@@ -45,8 +45,7 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_zipped: bo
     """Write a .csv file with the columns of the first scan, and a column `scan`."""
     names: tuple[str, ...] = ()
     with open_text_file(path, is_zipped=is_zipped) as put:
-        for index, scan in enumerate(scans):
-            number = find_number(scan, index)
+        for number, scan in enumerate(scans):
             cloud = select_points(scan, every_point=every_point)
             if not names:
                 names = tuple(cloud.columns)

@@ -42,9 +42,8 @@ class Scan:
         beams: the default number of beams of `to_laserscan`; None to use the number that the sensor
             declares, or the number of points.
         frame_id: the name of the frame of reference in ROS messages.
-        number: the index of the scan among the selected scans of its file, if the file is read in
-            separate pieces; or the index among all written scans, if they are written to several
-            files; else None.
+        number: the index of the scan in its file, if the file is read in separate pieces; or the
+            index among all written scans, if they are written to several files; else None.
         mount: the position and orientation of the sensor on its carrier (such as a vehicle), if the
             points are in the axes of the carrier; None if they are in the axes of the sensor.
         provenance: finds the frame that a point came from.

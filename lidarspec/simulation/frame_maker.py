@@ -229,6 +229,8 @@ class FrameMaker:
 
     def _check_lengths(self, leaf: Leaf, value: Any) -> None:
         """Raise an error if a value is an array whose lengths differ from those of its field."""
+        if isinstance(value, int | float | bytes | str):
+            return
         for axis, expected, length in zip(
             leaf.info.axes, leaf.shape, np.shape(value), strict=False
         ):

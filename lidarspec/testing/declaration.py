@@ -202,7 +202,8 @@ def _find_span_s(info: FieldInfo | None) -> float:
     unit_s = factor(info.unit, "s")
     if unit_s is None:
         return math.inf
-    return float(info.physical(info.limits[1]) + info.scale) * float(unit_s)
+    lowest, highest = info.limits
+    return float((highest - lowest + 1) * info.scale) * float(unit_s)
 
 
 def _check_options(sensor: Sensor) -> Findings:

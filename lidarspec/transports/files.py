@@ -45,9 +45,6 @@ BLOCK_BYTES = 1 << 18
 HEX_SUFFIXES = {".hex", ".txt"}
 #: Suffixes of files that are read as hexadecimal text only if their content is hexadecimal.
 TEXT_SUFFIXES = {".log", ".csv", ".asc"}
-#: The minimum number of bytes at the start of standard input that have to be hexadecimal text. The
-#: first bytes of a binary stream may be hexadecimal digits by chance.
-MIN_PIPED_HEX_BYTES = 4
 
 
 class RecordingTransport(Transport):
@@ -396,17 +393,10 @@ def _open_by_content(
         return StreamCaptureTransport(name, file)
     if is_capture(start):
         return CaptureTransport(name, file, sender=sender)
-    if _is_hex_text(path, start):
+    suffixes = set(Path(path.lower()).suffixes[-2:])  # compression adds a second suffix
+    is_text = suffixes & HEX_SUFFIXES or (
+        suffixes & TEXT_SUFFIXES and is_hexadecimal(start, whole=len(start) < HEAD_BYTES)
+    )
+    if is_text:
         return HexTransport(name, file)
     return FileTransport(name, file)
-
-
-def _is_hex_text(path: str, start: bytes) -> bool:
-    """Return whether a file is hexadecimal text, by its name and its first bytes."""
-    if path == "-":
-        # A pipe may contain only a part of the first line yet.
-        return len(start) >= MIN_PIPED_HEX_BYTES and is_hexadecimal(start, whole=False)
-    suffixes = set(Path(path.lower()).suffixes[-2:])  # compression adds a second suffix
-    if suffixes & HEX_SUFFIXES:
-        return True
-    return bool(suffixes & TEXT_SUFFIXES) and is_hexadecimal(start, whole=len(start) < HEAD_BYTES)

@@ -148,7 +148,7 @@ class RateTally:
             valid=_mean([valid for _, valid in self._sizes]),
             error_rate=_share(change["rejected"], change["frames"]),
             skipped_rate=_share(change["skipped"], good_bytes),
-            loss_rate=_share(change["lost"], self.packets) if counts_losses else None,
+            loss_rate=_share(max(change["lost"], 0), self.packets) if counts_losses else None,
             jitter_s=self._jitter() if self._has_arrivals else None,
             longest_gap_s=self._longest_gap if self._has_arrivals else None,
             bytes_per_s=change["bytes_in"] / duration if duration else None,

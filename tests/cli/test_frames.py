@@ -57,10 +57,6 @@ def test_a_frame_is_parsed_from_a_file_and_from_standard_input(tmp_path: Path) -
     assert ran("parse", raw, *SENSOR).stdout == ran("parse", text, *SENSOR).stdout == plain
     assert ran("parse", "-", *SENSOR, given=EXAMPLE).stdout == plain
     assert ran("parse", "-", *SENSOR, given=text.read_bytes()).stdout == plain
-    read = ("read", "-", "--packets", "--json", *SENSOR)
-    from_bytes = ran(*read, given=EXAMPLE).stdout
-    assert from_bytes
-    assert ran(*read, given=text.read_bytes()).stdout == from_bytes
 
 
 def test_json_holds_the_integers_of_the_wire() -> None:

@@ -28,24 +28,6 @@ def frames() -> list[bytes]:
     return packets[:150] + packets[151:]
 
 
-def test_info_names_a_sensor_that_begins_to_send_later(frames: list[bytes], tmp_path: Path) -> None:
-    path = tmp_path / "late.pcap"
-    later = simulate(ls.sensor("hesai-xt32"), 20)
-    sent = [(data, ("10.0.0.1", 2368)) for data in frames]
-    sent += [(data, ("10.0.0.2", 2368)) for data in later]
-    datagrams = [
-        Datagram(data, START + number * STEP, sender, ("255.255.255.255", 2368))
-        for number, (data, sender) in enumerate(sent)
-    ]
-    path.write_bytes(make_capture_head(ETHERNET) + b"".join(map(make_datagram_record, datagrams)))
-    assert [
-        (content["sensors"], content["command"]) for content in run_json("info", path)["contents"]
-    ] == [
-        (["velodyne-vlp16"], f"lidarspec view '{path}?src=10.0.0.1' -s velodyne-vlp16"),
-        (["hesai-xt32"], f"lidarspec view '{path}?src=10.0.0.2' -s hesai-xt32"),
-    ]
-
-
 @pytest.mark.slow
 def test_a_capture_of_two_sensors_with_one_lost_packet(frames: list[bytes], tmp_path: Path) -> None:
     path, senders = tmp_path / "drive.pcap", [("10.0.0.1", 2368), ("10.0.0.2", 2368)]
