@@ -578,7 +578,7 @@ def _follow_batch(
             totals["points"] += record["points"]
             lost = record.get("unread", 0)  # records of earlier versions lack it
             if lost:
-                progress.note(f"{record['source']} is corrupt: a part of it was not read")
+                progress.note(f"{record['source']} is corrupt: some bytes were not read")
                 unread += lost
             progress(
                 lambda: f"{folder}: {totals['points']} points",
