@@ -293,6 +293,14 @@ class CapturedDatagrams:
             )
             start = stop
 
+    def count_by_host(self) -> dict[str, int]:
+        """Return the number of datagrams of each IP address."""
+        hosts = dict[str, int]()
+        numbers = np.bincount(self.senders, minlength=len(self.names)).tolist()
+        for (host, _), number in zip(self.names, numbers, strict=True):
+            hosts[host] = hosts.get(host, 0) + number
+        return hosts
+
     def iter_frame_senders(self, frames: Frames) -> Iterator[tuple[str, Sender]]:
         """Yield (frame type, sender) of the frames that were found in these datagrams."""
         if len(self.names) == 1:

@@ -7,6 +7,7 @@ frames in batches.
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -278,7 +279,7 @@ class FileInput(DeviceInput):
 
     @property
     def warnings(self) -> list[str]:
-        warnings = list(self._transport.warnings)
+        warnings = [*self._transport.warnings, *self.senders.warnings]
         stats = self.decoder.stats
         if (
             self.state == "ended"
@@ -377,6 +378,7 @@ class FileInput(DeviceInput):
                         part.buffer, part.starts, part.sizes, part.at
                     )
                     self.senders.check(part.iter_frame_senders(frames))
+                    self.senders.count(part.count_by_host())
                     yield FrameBatch([frames])
             yield FrameBatch(self.decoder.take_pending())
             return
@@ -388,6 +390,7 @@ class FileInput(DeviceInput):
                 self.senders.check(
                     find_frame_senders(chunks, batches[0], self.decoder.stats.bytes_in)
                 )
+                self.senders.count(Counter(chunk.sender[0] for chunk in chunks if chunk.sender))
             yield FrameBatch(batches)
         yield FrameBatch(self.decoder.take_pending())
 

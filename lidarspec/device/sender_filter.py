@@ -3,13 +3,14 @@
 All data of a sensor comes from one IP address. The frames of one type come from one port, which may
 change after a restart. Two alternating ports belong to two sensors.
 
-For a file, `SenderCheck` raises an error if two sensors send frames. For a live source,
-`SenderFilter` selects the first sender of data frames, and drops the datagrams of other senders.
+For a file, `SenderCheck` raises an error if two sensors send frames, and warns if other devices
+send datagrams without such frames. For a live source, `SenderFilter` selects the first sender of
+data frames, and drops the datagrams of other senders.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
 
@@ -36,6 +37,33 @@ class SenderCheck:
         self._address: Sender | None = None  # of the sensor
         self._current: dict[str, Sender] = {}  # sender of each frame type
         self._previous: dict[str, dict[Sender, None]] = {}  # its earlier senders, oldest first
+        self._datagrams_by_host: dict[str, int] = {}  # of the first `MAX_SENDERS` IP addresses
+
+    @property
+    def warnings(self) -> list[str]:
+        """The warning about datagrams of other devices."""
+        if self._address is None:
+            return []
+        host = self._address[0]
+        others = {other: n for other, n in self._datagrams_by_host.items() if other != host}
+        if not others:
+            return []
+        most = max(others, key=others.__getitem__)
+        text = (
+            f"{self._source}: datagrams from other devices than {host}, most of them from {most},"
+            f" contain no frames of {self._sensor.id}"
+        )
+        if str(self._source) == "-":
+            return [text]
+        chosen = quote(with_option(self._source, "src", host))
+        return [f"{text}; next: repeat with {chosen} to leave them out"]
+
+    def count(self, datagrams_by_host: Mapping[str, int]) -> None:
+        """Count the datagrams of each IP address, for the warning."""
+        for host, number in datagrams_by_host.items():
+            counted = self._datagrams_by_host.get(host, 0)
+            if number and (counted or len(self._datagrams_by_host) < MAX_SENDERS):
+                self._datagrams_by_host[host] = counted + number
 
     def check(self, sent: Iterable[tuple[str, Sender]]) -> None:
         """Check the senders of the next frames.

@@ -96,8 +96,11 @@ class LimitedRecorder:
 
     @property
     def duration(self) -> float | None:
-        """Seconds from the first to the last recorded arrival; None if there is none."""
-        if self.first is None or self.last is None:
+        """Seconds from the first to the last recorded arrival; None if they are unknown.
+
+        In a corrupt capture, the last arrival may be before the first.
+        """
+        if self.first is None or self.last is None or self.last < self.first:
             return None
         return (self.last - self.first) / 1e9
 

@@ -35,6 +35,7 @@ from lidarspec.captures.pcap import (
 from lidarspec.captures.records import make_capture_head
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.files import CaptureTransport, open_file
+from lidarspec.transports.protocol import Chunk
 from tests import made_captures as made
 from tests.lines import turning
 from tests.shapes import SHAPES
@@ -473,6 +474,36 @@ def test_frames_of_two_senders_are_not_mixed(other: tuple[str, int], tmp_path: P
     with ls.open(f"{path}?src={two}", "robosense-m1") as device:
         assert sum(map(len, device.packets())) == 20
         assert device.stats.foreign == 20
+
+
+@pytest.mark.parametrize("batch_bytes", [0, 1300])
+def test_datagrams_of_other_devices_are_reported_once(batch_bytes: int, tmp_path: Path) -> None:
+    sensor = ls.sensor("velodyne-vlp16")
+    mine = [(data, ("10.0.0.1", 2368)) for data in simulate(sensor, 40)]
+    others = [(data, ("10.0.0.2", 2368)) for data in simulate(ls.sensor("hesai-xt32"), 30)]
+    sent = [mine[0], (b"\x00" * 48, ("10.0.0.3", 123)), *mine[1:], *others]
+    capture, recording = tmp_path / "two.pcap", tmp_path / "two.lsr"
+    records = [
+        make_datagram_record(Datagram(data, index, sender, made.DESTINATION))
+        for index, (data, sender) in enumerate(sent)
+    ]
+    capture.write_bytes(make_capture_head(ETHERNET) + b"".join(records))
+    with ls.Recorder(recording, sensor) as recorder:
+        for index, (data, sender) in enumerate(sent):
+            recorder.write(Chunk(data, index, sender))
+    for path in (capture, recording):
+        with ls.open(path, sensor) as device:
+            device.read_ahead(batch_bytes)
+            assert sum(map(len, device.packets())) == 40
+            assert [text for text in device.warnings if "other devices" in text] == [
+                f"{path}: datagrams from other devices than 10.0.0.1, most of them from 10.0.0.2,"
+                " contain no frames of velodyne-vlp16; next: repeat with"
+                f" '{path}?src=10.0.0.1' to leave them out"
+            ]
+        with ls.open(f"{path}?src=10.0.0.1", sensor) as device:
+            assert sum(map(len, device.packets())) == 40
+            assert not any("other devices" in text for text in device.warnings)
+            assert device.stats.bytes_skipped == 0
 
 
 def test_a_calibration_of_another_address_is_not_mixed_in(tmp_path: Path) -> None:
