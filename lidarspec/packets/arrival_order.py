@@ -32,16 +32,16 @@ class UnconfirmedTimes:
     """Consecutive packets, each at an irregular time after the packet before.
 
     Attributes:
-        confirmed: the time of the packet before these packets, ns.
-        last: the time of the last of these packets, ns.
+        confirmed_ns: the time of the packet before these packets.
+        last_ns: the time of the last of these packets.
         next_row: the row of the packet that follows them.
         packets: the number of these packets.
         lost: the number of packets counted as lost since the confirmed time.
         skipped: the number of packets lost since then according to skipped bytes.
     """
 
-    confirmed: int
-    last: int
+    confirmed_ns: int
+    last_ns: int
     next_row: int
     packets: int = 0
     lost: int = 0
@@ -49,8 +49,8 @@ class UnconfirmedTimes:
 
     def are_wrong(self, time: int) -> bool:
         """Return whether the times are wrong, because the next packet is at `time`, ns."""
-        is_ascending = self.confirmed <= self.last <= time
-        return not is_ascending and 0 <= time - self.confirmed <= MAX_STEP_NS
+        is_ascending = self.confirmed_ns <= self.last_ns <= time
+        return not is_ascending and 0 <= time - self.confirmed_ns <= MAX_STEP_NS
 
 
 class ArrivalOrder:
@@ -209,16 +209,16 @@ class ArrivalOrder:
             unconfirmed.skipped += by_bytes.item(index)
             if unconfirmed.are_wrong(time):
                 pace = paces.item(row)
-                step = time - unconfirmed.confirmed - unconfirmed.packets * pace
+                step = time - unconfirmed.confirmed_ns - unconfirmed.packets * pace
                 lost = int(self._count_missing(step, pace, unconfirmed.skipped))
                 self._stats.lost += lost - unconfirmed.lost
                 unconfirmed.lost = lost
-            unconfirmed.last = time
+            unconfirmed.last_ns = time
             unconfirmed.next_row += 1
             unconfirmed.packets += 1
         if self._unconfirmed is not None:
             if self._unconfirmed.next_row == len(times):
-                self._unconfirmed.next_row = 0
+                self._unconfirmed.next_row = 0  # in the next batch
             else:
                 self._unconfirmed = None
 
