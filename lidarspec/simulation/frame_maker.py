@@ -198,7 +198,7 @@ class FrameMaker:
             except Exception as error:  # a function of the plugin may raise anything
                 raise self._make_error(
                     path,
-                    f"sweep returns {value!r}, which cannot be encoded:"
+                    f"the simulated value {value!r} cannot be encoded:"
                     f" {type(error).__name__}: {error}",
                 ) from error
         for path, ending in self.schema.endings.items():
@@ -217,14 +217,14 @@ class FrameMaker:
                 shape = np.asarray(find_code(info, value), np.float64).shape
             except (TypeError, ValueError):
                 raise self._make_error(
-                    path, f"sweep returns {value!r:.60}, expected numbers"
+                    path, f"the simulated value is {value!r:.60}, expected numbers"
                 ) from None
             if value is None:
-                raise self._make_error(path, "sweep returns None, expected numbers")
+                raise self._make_error(path, "the simulated value is None, expected numbers")
             if len(shape) > len(info.axes):
                 expected = f"at most {len(info.axes)} axes" if info.axes else "a single number"
                 raise self._make_error(
-                    path, f"sweep returns values of shape {shape}, expected {expected}"
+                    path, f"the simulated values have the shape {shape}, expected {expected}"
                 )
 
     def _check_lengths(self, leaf: Leaf, value: Any) -> None:
@@ -237,7 +237,7 @@ class FrameMaker:
             if length not in (1, expected):
                 raise self._make_error(
                     leaf.info.path,
-                    f"sweep returns {length} values, but {axis} has {expected} elements",
+                    f"{length} values are simulated, but {axis} has {expected} elements",
                 )
 
     def _make_error(self, path: str, reason: str) -> SpecError:
@@ -354,7 +354,7 @@ class FrameMaker:
                 continue
             if leaf is None:
                 raise self._make_error(
-                    path, "sweep returns a value for a field that the frame does not have"
+                    path, "a value is simulated for a field that the frame does not have"
                 )
             given = [find_code(leaf.info, values.get(path, 0)) for values, _ in frames]
             for value in given:

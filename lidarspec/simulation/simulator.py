@@ -964,10 +964,12 @@ class FramesWithoutPoints:
         declared = self._sensor.frames[name]
         state = self._sensor.state.get(name, {})
         sweep = declared.simulation.sweep
-        given = [{**state, **values} for _ in numbers]
-        if sweep is not None:
+        if sweep is None:
+            swept: list[Mapping[str, Any]] = [{} for _ in numbers]
+        else:
             with plugin_errors(f"sweep of {name}", self._sensor.id, sweep):
-                given = [{**state, **sweep(number), **values} for number in numbers]
+                swept = [sweep(number) for number in numbers]
+        given = [{**state, **own, **values} for own in swept]
         table = self._get_maker(name).table(given)
         if declared.imu is not None:
             rest = self._rests.setdefault(name, RestingImu(self._sensor, name, given[0]))

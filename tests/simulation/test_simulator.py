@@ -523,13 +523,16 @@ def test_an_intensity_that_sweep_gives_stays() -> None:
 @pytest.mark.parametrize(
     ("given", "reason"),
     [
-        ({"count": 3}, "samples.distance: sweep returns 4 values, but samples has 3 elements"),
-        ({"count": [4, 4]}, "count: sweep returns values of shape (2,), expected a single number"),
-        ({"count": "four"}, "count: sweep returns 'four', expected numbers"),
-        ({"count": None}, "count: sweep returns None, expected numbers"),
+        ({"count": 3}, "samples.distance: 4 values are simulated, but samples has 3 elements"),
+        (
+            {"count": [4, 4]},
+            "count: the simulated values have the shape (2,), expected a single number",
+        ),
+        ({"count": "four"}, "count: the simulated value is 'four', expected numbers"),
+        ({"count": None}, "count: the simulated value is None, expected numbers"),
         (
             {"samples.distance": np.ones((4, 2))},
-            "samples.distance: sweep returns values of shape (4, 2), expected at most 1 axes",
+            "samples.distance: the simulated values have the shape (4, 2), expected at most 1 axes",
         ),
     ],
 )
@@ -550,7 +553,7 @@ def test_values_of_a_sweep_that_do_not_fit_their_field_are_spec_errors(
 
 def test_an_error_of_a_periodic_frame_names_the_frame() -> None:
     device = SimulatedDevice(periodic_sweep_of_nothing.lidarspec_sensors()[0])
-    with pytest.raises(SpecError, match=r"^broken-one: status\.status: sweep returns a value for"):
+    with pytest.raises(SpecError, match=r"^broken-one: status\.status: a value is simulated for"):
         device.start(0)
 
 
