@@ -202,7 +202,7 @@ def replies_belong_to_one_command(subject: SensorUnderTest, name: str) -> None:
                 if not is_fixed or path in command.matches or info.const is not None:
                     continue
                 require(
-                    command.fixed[path] == other.fixed[path],
+                    find_code(info, command.fixed[path]) == find_code(info, other.fixed[path]),
                     "LS606",
                     f"the reply {reply} contains {path}, which distinguishes the commands {name}"
                     f" and {other_name}, but {name} does not compare it",

@@ -154,15 +154,26 @@ def test_vectors_in_two_quadrants_prove_the_sense_of_the_points() -> None:
     assert "data: sense" in subject.picture
 
 
+def install_module(monkeypatch: pytest.MonkeyPatch, folder: Path, value: str, text: str) -> None:
+    """Install a module of a distribution "lidarspec-acme".
+
+    Args:
+        value: the value of the entry point of the sensor "acme-x1", such as "acme_lidar:X1".
+        text: the content of the module.
+    """
+    module = value.partition(":")[0]
+    (folder / f"{module}.py").write_text(text, encoding="utf-8")
+    monkeypatch.syspath_prepend(folder)
+    entry = EntryPoint("acme-x1", value, "lidarspec-acme", "1.0")
+    offered = Registry(offered=[entry])
+    monkeypatch.setattr(check, "registry", lambda: offered)
+    monkeypatch.setattr(check, "entry_points", lambda group: [entry] if group == SENSORS else [])
+
+
 def test_a_sensor_whose_plugin_does_not_load_is_checked_as_its_distribution(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "acme_lidar.py").write_text("X1 = 1 / 0\n", encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path)
-    entry = EntryPoint("acme-x1", "acme_lidar:X1", "lidarspec-acme", "1.0")
-    broken = Registry(offered=[entry])
-    monkeypatch.setattr(check, "registry", lambda: broken)
-    monkeypatch.setattr(check, "entry_points", lambda group: [entry] if group == SENSORS else [])
+    install_module(monkeypatch, tmp_path, "acme_lidar:X1", "X1 = 1 / 0\n")
     (finding,) = check.find_target("acme-x1").findings
     assert (finding.code, finding.line) == ("LS001", 1)
     assert "ZeroDivisionError" in finding.what
@@ -171,12 +182,7 @@ def test_a_sensor_whose_plugin_does_not_load_is_checked_as_its_distribution(
 def test_an_entry_point_that_names_no_sensor_is_a_finding(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "acme_renamed.py").write_text("DATA = {}\n", encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path)
-    entry = EntryPoint("acme-x1", "acme_renamed:DATA", "lidarspec-acme", "1.0")
-    broken = Registry(offered=[entry])
-    monkeypatch.setattr(check, "registry", lambda: broken)
-    monkeypatch.setattr(check, "entry_points", lambda group: [entry] if group == SENSORS else [])
+    install_module(monkeypatch, tmp_path, "acme_renamed:DATA", "DATA = {}\n")
     for name in ("acme-x1", "lidarspec-acme"):
         (report,) = check.iter_reports(check.find_target(name), name)
         (finding,) = report.findings
@@ -218,13 +224,15 @@ def test_a_report_counts_the_checks_that_a_fatal_finding_stops() -> None:
     assert report.skipped["replies_can_match"] == "not tested because of LS301"
 
 
+@pytest.mark.parametrize("number", [Int16ul, Int16sl])
 @pytest.mark.parametrize(
     ("wraps_at", "codes"), [(None, {"LS509"}), (50.0, set()), (65.536, set()), (65.6, {"LS509"})]
 )
 def test_the_declared_wrap_of_a_clock_fits_its_field(
-    wraps_at: float | None, codes: set[str]
+    wraps_at: float | None, codes: set[str], number: Any
 ) -> None:
-    sensor = sound.sensor(clock=Clock("time", wraps_at=wraps_at))  # a field of 16 bits, in ms
+    struct = sound.make_frame(time=Scaled(number, 0.001, "s"))
+    sensor = sound.sensor(sound.frame(struct), clock=Clock("time", wraps_at=wraps_at))
     assert declared_codes(sensor) == codes
 
 
