@@ -124,7 +124,7 @@ def _check_sensor(sensor: Sensor) -> Findings:
 
 
 def _check_required_fields(sensor: Sensor) -> Findings:
-    """Yield findings for fields that scans, clock or counter need: missing, or without unit."""
+    """Yield findings for fields that scans, clock or counter require, but that do not fit."""
     fields: dict[str, FieldInfo] = {}
     for name in sensor.main_frames:
         fields |= get_codec(sensor.frames[name]).schema.scan_names
