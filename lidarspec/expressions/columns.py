@@ -639,12 +639,12 @@ def align_points(
     """Align the coordinates and other columns that `points` returns.
 
     Returns:
-        The arrays, the names of their axes, the smallest `ready` of the columns, and the common
-        shape of the arrays, (n, ...).
+        The arrays, the names of their axes, the number of packets for which all columns are known,
+        and the common shape of the arrays, (n, ...).
 
     Raises:
         SpecError: if coordinates belong to different arrays of the frame or have different lengths,
-            or if no value uses a field of an array along which the points vary.
+            or if the points vary along an array of which no value uses a field.
     """
     anchor = Column(
         np.zeros((1,) * (1 + batch.table.schema.depth())),
@@ -663,9 +663,9 @@ def align_points(
         else:
             array = "an array"
         raise SpecError(
-            f"the values of the points vary along {array}, but no value uses a field of this array"
-            f" ({_describe_lengths(named, axes)}): use along(...) to assign plain numbers to an"
-            " array",
+            f"the points vary along {array}, but no value uses a field of this array"
+            f" ({_describe_lengths(named, axes)}): if the values are plain numbers, name their"
+            " array with along(...)",
             rule="LS214",
         )
     return arrays, axes, ready, shape

@@ -91,7 +91,8 @@ class Decoder:
     ) -> None:
         if not sensor.incoming:
             raise UsageError(
-                f"{sensor.id} has no frames without its configuration file: see sensor.configure"
+                f"the frames of {sensor.id} are known only from its configuration file: pass the"
+                " file to sensor.configure"
             )
         self.sensor = sensor
         self.stream = stream

@@ -59,7 +59,7 @@ class LayoutFamily:
 
 
 class LayoutFamilies:
-    """The families of the layouts of a frame type."""
+    """Finds layouts of a frame type that differ only in the length of an array."""
 
     def __init__(self) -> None:
         self._numbers: dict[Hashable, int] = {}
@@ -68,7 +68,7 @@ class LayoutFamilies:
     def split(
         self, groups: list[LayoutGroup], make_checker: MakeChecker
     ) -> tuple[list[JointChecker], list[LayoutGroup]]:
-        """Return checkers for the groups to check together, and all other groups."""
+        """Return checkers for groups that can be checked together, and the remaining groups."""
         if len(groups) < MANY_LAYOUTS:
             return [], groups
         left = list[LayoutGroup]()

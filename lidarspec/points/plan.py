@@ -1,11 +1,11 @@
 """Plan the columns of a sensor's points as expressions of its fields.
 
-The `points` function is traced once for each layout. `Plan` converts its result to expressions of
-the columns, by the formulas of `points.conventions`. A back end compiles the plan to a
-`ColumnMaker`, which computes the columns.
+The `points` function is traced once for each layout. `Plan` converts the result of
+`points` to one expression for each column, by the formulas of `points.conventions`. A back end
+compiles the plan to a `ColumnMaker`, which computes the columns.
 
 The columns of a `Cartesian` result are computed in float64. The columns of a `Polar` result may be
-computed in float32, so that the floating-point fields of a batch have to be within
+computed in float32. This requires that the floating-point fields of a batch are within
 `MODERATE_SIZES`.
 """
 

@@ -280,7 +280,7 @@ class Recording(ClosingContext):
         with system_errors(path):
             self._file = file or (sys.stdin.buffer if self.path == "-" else open_stored(self.path))
         try:
-            self._records = self._read_header()
+            self._records = self._read_until_records()
         except BaseException:
             self.close()
             raise
@@ -343,7 +343,7 @@ class Recording(ClosingContext):
         self._place = 0
         self.offset = offset
 
-    def _read_header(self) -> Iterator[Record]:
+    def _read_until_records(self) -> Iterator[Record]:
         """Read the header and return the records after it."""
         with system_errors(self.path):
             magic = self._file.read(len(MAGIC))

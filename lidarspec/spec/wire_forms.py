@@ -284,7 +284,7 @@ def check_wire_form(form: object) -> None:
 
 @runtime_checkable
 class BulkEnds(Protocol):
-    """A wire form that is fast because it finds the ends of many candidates at once."""
+    """A wire form that is fast because it finds the sizes of many candidates at once."""
 
     def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
         """Return the size of the frame at each offset, or `NO_END` or `NO_FRAME`, (n,).

@@ -183,7 +183,10 @@ class Replay:
                 yield from source.warnings
 
     def _await_listener(self) -> Iterator[str]:
-        """Wait until a reader opens the outlet; yield a message if a reader has disconnected."""
+        """Wait until a reader has opened the outlet.
+
+        If the reader of the turn before has disconnected meanwhile, yield a message about it.
+        """
         if isinstance(self._destination, Outlet):
             has_reader_left = self._destination.await_listener()
             if has_reader_left:

@@ -202,7 +202,7 @@ def read_columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> 
 
 
 def read_rows(path: str | Path | Learned) -> list[tuple[int, list[str]]]:
-    """Return the headings and the table, each row with its line number."""
+    """Return the rows of the table, each with its line number; the headings are first."""
     try:
         reader = csv.reader(
             io.StringIO(read_content(path).decode("utf-8-sig", "replace"), newline="")
